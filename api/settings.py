@@ -9,7 +9,6 @@ so.
 import ipaddress
 import os
 import re
-import shlex
 import tomllib
 from enum import StrEnum
 from pathlib import Path
@@ -106,12 +105,6 @@ class Settings(BaseSettings):
         pattern=r"^[A-Za-z_][A-Za-z0-9_]*$",
         description="Name of an environment variable that holds the master keys in base64, the "
         "first is current, separated by commas or newlines; instead of `master_key_file`.",
-    )
-    master_key_command: str | None = Field(
-        None,
-        description="Command that writes the master keys to its standard output in base64, one a "
-        "line, the first is current; instead of `master_key_file`. For a key management service. "
-        "It is split as a shell would, but run without one.",
     )
     contract_file: Path | None = Field(
         None,
@@ -319,12 +312,6 @@ class Settings(BaseSettings):
         description="Give the contract's graphs, at `/v1/pack`, to pages that have a token, "
         "and let the page run them. Mind the licence of the weights (docs/models.md).",
     )
-    audit_report_file: Path | None = Field(
-        None,
-        description="The `report.json` that `veilface audit templates` or `veilface audit "
-        "fairface` wrote: its figures are the answer of `GET /v1/contract/audit`. Unset: that "
-        "answer says that the deployment has not been audited.",
-    )
     demo: bool = Field(False, description="Say in every answer that the pack is the demo model.")
 
     @field_validator("providers", mode="before")
@@ -431,26 +418,11 @@ class Settings(BaseSettings):
             raise ValueError("must not be below lockout_after")
         return value
 
-    @field_validator("master_key_variable", "master_key_command")
+    @field_validator("master_key_variable")
     @classmethod
     def _one_source_of_keys(cls, value: str | None, info: ValidationInfo) -> str | None:
-        earlier = [info.data.get(name) for name in ("master_key_file", "master_key_variable")]
-        if value is not None and any(source is not None for source in earlier):
-            raise ValueError(
-                "give one of master_key_file, master_key_variable and master_key_command"
-            )
-        return value
-
-    @field_validator("master_key_command")
-    @classmethod
-    def _a_command(cls, value: str | None) -> str | None:
-        if value is not None:
-            try:
-                words = shlex.split(value)
-            except ValueError:
-                raise ValueError("is not a command line: a quotation mark is not closed") from None
-            if not words:
-                raise ValueError("is empty")
+        if value is not None and info.data.get("master_key_file") is not None:
+            raise ValueError("give one of master_key_file and master_key_variable")
         return value
 
     @classmethod

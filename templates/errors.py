@@ -19,7 +19,6 @@
     │   │       └── Superseded   a decision on a template that was replaced or erased [12]
     │   ├── InvalidIdentifier    a subject id, tenant name or cursor that breaks the rules [1]
     │   ├── UnknownTenant        no tenant of this name [1]
-    │   │   ├── AlteredTenant    its row is not as this program left it [11]
     │   │   └── RetiredRotation  no rotation key of this epoch any more [11]
     │   ├── LockedOut            too many failed attempts on the subject [12]
     │   ├── Replayed             a challenge or a token that was seen before [12]

@@ -13,6 +13,7 @@ import tomllib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import httpx
@@ -23,6 +24,7 @@ import typer.main
 import yaml
 
 from api.cli.app import COMMANDS, app, load
+from api.http.receipts import receipt_key_json
 from api.process.opening import open_keyring, open_store
 from api.settings import Settings
 from models.pack_file import read_pack_file
@@ -83,7 +85,7 @@ HERE = {
         "veilface keys revoke 3f9a1c0b7d2e",
         "veilface keys replace 3f9a1c0b7d2e --grace-hours 48",
         "veilface keys rotate-tenant --tenant default",
-        "veilface keys renew",
+        "veilface keys renew audit-before-theft.jsonl",
         "veilface keys master --master-key-file /etc/veilface/master.key",
         "veilface keys rotate --retire",
         "veilface keys rewrap --retire",
@@ -97,6 +99,8 @@ HERE = {
         "veilface audit-log verify --anchor head.txt",
         "veilface audit-log head > head.txt",
         "veilface audit-log show --subject alice --limit 100",
+        "veilface audit-log archive audit-2026.jsonl",
+        "veilface audit-log verify-archive audit-2026.jsonl --public-key contract.json",
         "veilface db current --json",
         "veilface bench models --pack buffalo_l",
     )
@@ -524,18 +528,22 @@ def test_the_architecture_names_what_exists() -> None:
 def fail_once(deployment: Deployment, subject: str) -> None:
     """A rejected verification, as over REST, where it counts on the subject."""
     store = open_store(deployment.settings, open_keyring(deployment.settings))
-    held = store.subjects.describe("default", subject)
-    assert held is not None
-    store.attempts.conclude(
+    decided = SimpleNamespace(accepted=False, level="fmr-1e-3")
+    store.attempts.decide(
         "default",
         subject,
-        accepted=False,
-        template_id=held.template_id,
-        contract_id=held.contract_id,
-        level="fmr-1e-3",
-        nonce=None,
+        lambda _: decided,
+        contract_id=deployment.contract.contract_id,
         by=By(),
     )
+    store.close()
+
+
+def write_contract_answer(deployment: Deployment, file: Path) -> None:
+    """Write what `GET /v1/contract` says of the receipt key that is in force."""
+    store = open_store(deployment.settings, open_keyring(deployment.settings))
+    answer = {"receipt_key": receipt_key_json(store.signer.public_key())}
+    file.write_text(json.dumps(answer))
     store.close()
 
 
@@ -556,8 +564,12 @@ def test_commands_do_what_the_page_says(tmp_path: Path, monkeypatch: pytest.Monk
     assert run("audit-log", "head").stdout
     blocks = [each for each in SNIPPETS if (each.page, each.first) in HERE]
     assert len(blocks) == len(HERE)
-    anchor = next(each for each in blocks if "> head.txt" in each.code)
-    for snippet in [anchor, *blocks]:
+    (anchor,) = (each for each in blocks if "> head.txt" in each.code)
+    # A renewal puts the lines up to an earlier anchor into its archive.
+    first = next(i for i, each in enumerate(blocks) if "--anchor head.txt" in each.code)
+    for snippet in [*blocks[:first], anchor, *blocks[first:]]:
+        if "verify-archive" in snippet.code:
+            write_contract_answer(deployment, tmp_path / "contract.json")
         if "db unlock" in snippet.code:
             fail_once(deployment, "alice")
         for line in logical_lines(snippet.code):

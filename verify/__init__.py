@@ -9,7 +9,7 @@ from verify.challenge import MAX_FRAMES, MIN_FRAMES, Movement, draw_movements
 from verify.datasets import DatasetError, LabelledFolder, labelled_folder, read_lfw_pairs
 from verify.decision import Decision
 from verify.photo_probe import MAX_PROBE_PHOTOS, PhotoProbe
-from verify.stand_ins import StandIn, lift_stand_in
+from verify.stand_ins import StandIn
 from verify.verifier import OpenedTemplate, Verifier
 
 __all__ = [
@@ -30,6 +30,5 @@ __all__ = [
     "calibrate",
     "draw_movements",
     "labelled_folder",
-    "lift_stand_in",
     "read_lfw_pairs",
 ]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from templates.errors import VeilfaceError
-from templates.keys.bounded_file import read_at_most
+from templates.keys.private_file import read_at_most
 from verify.tenfold import FOLDS, Pair
 
 SUFFIXES = frozenset({".jpg", ".jpeg", ".jfif", ".png", ".webp", ".bmp"})

@@ -261,8 +261,6 @@ class Verifier:
         subspace = received.subspace
         if (subspace.n, subspace.m) != (binding.axes, binding.m):
             raise InvalidTemplate("the stored template has dimensions other than the contract's")
-        if isinstance(stored, StandIn) and stored.lifted is not None:
-            subspace = stored.lifted
         by_tenant = self._rotation.of(stored.template_id)
         by_holder = holder_rotation(
             holder_key or self._nobodys_key, stored.holder_salt or _NO_SALT, binding.axes
@@ -287,10 +285,8 @@ class Verifier:
     ) -> Decision:
         calibration, level = rule.calibration, rule.level
         unknown = isinstance(stored, StandIn)
-        # A stand-in is in no rotation, so neither is the probe: turning both leaves their distance
-        # as it is. The turned probe was computed in either case.
         distances = paired_distances(
-            probe if unknown else turned,
+            turned,
             template,
             metric=calibration.metric,
             steps=calibration.steps,

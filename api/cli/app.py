@@ -33,7 +33,7 @@ COMMANDS = {
     "keys": "Create, replace and revoke API keys; rotate keys; verify erasure receipts.",
     "models": "Fetch and inspect model packs (the weights you supply).",
     "db": "Migrate, check and clean up the database; set up tenants.",
-    "audit-log": "Verify and read the audit log, a chain of lines.",
+    "audit-log": "Verify, read and archive the audit log, a chain of lines.",
     "bench": "Time this machine, against the work that nothing can avoid.",
 }
 """The first paragraph of each command's help."""

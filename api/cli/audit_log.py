@@ -12,12 +12,14 @@ from api.cli.console import emit, message, progress, say, say_lines
 from api.cli.errors import UsageError
 from api.cli.files import read_bounded
 from api.cli.options import STORE, AsJson, takes_settings
+from api.cli.public_key import read_public_key
+from api.http.audit import operator
 from api.http.values import iso_time
 from api.process.opening import checked_store
 from api.settings import Settings
 from templates.store import TemplateStore
-from templates.store.audit_chain import Anchor, Line
-from templates.store.audit_log import AuditLog, BrokenAuditLog
+from templates.store.audit_archive import Archive, verify_archive
+from templates.store.audit_log import Anchor, AuditLog, BrokenAuditLog, Line
 from templates.store.identifiers import InvalidIdentifier
 
 PROBLEMS_SHOWN = 20
@@ -28,7 +30,7 @@ app = typer.Typer(no_args_is_help=True)
 
 @app.callback()
 def audit_log() -> None:
-    """Verify and read the audit log, a chain of lines."""
+    """Verify, read and archive the audit log, a chain of lines."""
 
 
 @app.command()
@@ -45,14 +47,14 @@ def verify(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Check the audit log and the records it covers; exit status 1 if anything is wrong.
+    """Check the audit log, and keys and lockouts against it; exit status 1 if anything is wrong.
 
-    Reports lines that were altered, removed, added or moved; tenants, API keys and counts of failed
-    attempts that contradict the log; actors that were never created; and nonces that were used
-    twice.
+    Names the first line that was altered, removed, added or moved. Where the log is whole, names
+    API keys that were made up, altered or put back after they ended, and counts of failed attempts
+    that were lowered. What the lines of an archive told is not looked at.
 
-    Needs: the database and its master key, under which chain and records are authenticated: whoever
-    can write the database but has no master key can write neither. The service may run meanwhile.
+    Needs: the database and its master key: whoever can write the database but has no master key can
+    write no line. The service may run meanwhile.
 
     Example: `veilface audit-log verify --anchor head.txt`
     """
@@ -61,37 +63,27 @@ def verify(
         checked_store(settings) as store,
         progress("verifying the audit log", _length(store.audit_log)) as advance,
     ):
-        report = store.audit_log.verify(anchor=kept, progress=advance)
-        records = store.check_records()
-    intact = report.intact and not records
-    problems = [
-        {"sequence": problem.sequence, "through": problem.through, "problem": problem.what}
-        for problem in report.problems
-    ]
+        report, records = store.verify_audit_log(anchor=kept, progress=advance)
+    problem, intact = report.problem, report.intact and not records
     if as_json:
         emit(
             {
                 "intact": intact,
                 "lines": report.lines,
                 "head": str(report.head),
-                "problems": problems,
-                "unlisted": report.unlisted,
+                "problem": None
+                if problem is None
+                else {"sequence": problem.sequence, "problem": problem.what},
                 "records": [{"problem": record.what, "about": record.about} for record in records],
             }
         )
     elif intact:
         checked = "" if kept is None else f", and holds the head of line {kept.sequence}"
         say(f"The audit log is intact: {report.lines} lines{checked}.")
-        say("API keys, tenants and counts of failed attempts are as it tells.")
+        say("API keys and counts of failed attempts are as it tells.")
     if not intact:
-        for problem in report.problems[:PROBLEMS_SHOWN]:
-            through = (
-                "" if problem.through in (None, problem.sequence) else f" to {problem.through}"
-            )
-            message(f"line {problem.sequence}{through}: {problem.what}")
-        more = len(problems) - PROBLEMS_SHOWN + report.unlisted
-        if more > 0:
-            message(f"… and {more} more")
+        if problem is not None:
+            message(f"line {problem.sequence}: {problem.what}")
         for record in records[:PROBLEMS_SHOWN]:
             message(f"{record.about}: {record.what}")
         if len(records) > PROBLEMS_SHOWN:
@@ -103,8 +95,63 @@ def verify(
 
 @app.command()
 @takes_settings(*STORE)
+def archive(
+    file: Annotated[Path, typer.Argument(help="New file for the lines.")],
+    *,
+    settings: Settings,
+    through: Annotated[
+        int | None,
+        typer.Option(min=1, help="Number of the last line to move. Unset: all there are."),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Move old lines of the audit log into a signed file.
+
+    The lines are verified first, and go from the database once the file is on disk. The log goes on
+    where the archive ends. Keep the file: `verify-archive` checks it without the database.
+
+    Example: `veilface audit-log archive audit-2026.jsonl`
+    """
+    with checked_store(settings) as store:
+        moved = store.archive_audit_log(file, through=through, by=operator())
+    _show_archive(moved, as_json, f"Moved {moved.lines} lines into {file}.")
+
+
+@app.command("verify-archive")
+def verify_archive_file(
+    file: Annotated[Path, typer.Argument(help="What `archive` wrote.")],
+    *,
+    public_key: Annotated[
+        str,
+        typer.Option(
+            help="The service's receipt key in base64, or a file with the JSON of "
+            "`GET /v1/contract`."
+        ),
+    ],
+    as_json: AsJson = False,
+) -> None:
+    """Check an archive's signature and lines; exit status 1 if they are not good.
+
+    Needs no service and no other key.
+
+    Example: `veilface audit-log verify-archive audit-2026.jsonl --public-key contract.json`
+    """
+    checked = verify_archive(file, read_public_key(public_key))
+    _show_archive(checked, as_json, f"{file} is intact: {checked.lines} lines.")
+
+
+def _show_archive(archived: Archive, as_json: bool, sentence: str) -> None:
+    if as_json:
+        emit({"lines": archived.lines, "base": str(archived.base), "last": str(archived.last)})
+        return
+    say(sentence)
+    say(f"Its lines follow on {archived.base} and end with {archived.last}.")
+
+
+@app.command()
+@takes_settings(*STORE)
 def head(*, settings: Settings, as_json: AsJson = False) -> None:
-    """Print the number and hash of the last line, to be kept elsewhere.
+    """Print the number and MAC of the last line, to be kept elsewhere.
 
     Keep it where the database administrator cannot write: `verify --anchor` then detects a log that
     was rolled back to an earlier state.
@@ -114,7 +161,7 @@ def head(*, settings: Settings, as_json: AsJson = False) -> None:
     with checked_store(settings) as store:
         last = store.audit_log.head()
     if as_json:
-        emit({"sequence": last.sequence, "hash": last.hash.hex()})
+        emit({"sequence": last.sequence, "mac": last.mac.hex()})
     else:
         say(str(last))
 
@@ -140,11 +187,11 @@ def show(
     """
     with checked_store(settings) as store:
         name = tenant or (settings.default_tenant if subject is not None else None)
-        pseudonyms = () if subject is None else store.signer.pseudonyms(str(name), subject)
+        pseudonym = None if subject is None else store.signer.pseudonym(str(name), subject)
         lines = store.audit_log.lines(after=after)
         if name is not None:
             lines = _lines_of(store, name, lines)
-        chosen = (line for line in lines if not pseudonyms or line.pseudonym in pseudonyms)
+        chosen = (line for line in lines if pseudonym in (None, line.pseudonym))
         say_lines(json.dumps(_described(line)) for line in islice(chosen, limit))
 
 

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from api.cli.console import emit, message, progress, say
+from api.cli.console import emit, message, say
 from api.cli.errors import UsageError
 from api.cli.options import STORE, AsJson, Tenant, takes_settings
 from api.http.audit import operator
@@ -32,8 +32,7 @@ def upgrade(*, settings: Settings, as_json: AsJson = False) -> None:
     """Migrate the database to the schema of this version.
 
     `serve` does this when it starts; run it first if several machines start at once.
-    Safe to run again. Make a backup, and stop every process of an earlier version first, unless
-    the new schema serves it (docs/deployment.md "An upgrade without a pause").
+    Safe to run again. Make a backup, and stop every process of an earlier version first.
 
     Example: `veilface db upgrade --database-url postgresql+psycopg://veilface@localhost/veilface`
     """
@@ -232,14 +231,15 @@ def erase_tenant(
 ) -> None:
     """Erase a tenant: its subjects, templates, keys and rotation; write a signed receipt.
 
-    Its API keys are revoked first. Verify the receipt with `veilface keys verify-receipt`.
+    All of it in one transaction, for which other writes wait. Verify the receipt with
+    `veilface keys verify-receipt`.
 
     Example: `veilface db erase-tenant acme --confirm acme --out receipt.json`
     """
     if confirm != tenant:
         raise UsageError("--confirm must repeat the name of the tenant; nothing was erased")
-    with checked_store(settings) as store, progress("erasing", None) as advance:
-        receipt = store.tenant_erasures.erase(tenant, by=operator(), progress=advance).receipt
+    with checked_store(settings) as store:
+        receipt = store.erasures.erase_tenant(tenant, by=operator()).receipt
     answer = receipt_json(receipt)
     if out is None:
         emit(answer)

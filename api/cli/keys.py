@@ -8,20 +8,21 @@ import typer
 
 from api.cli import master_keys, renewal
 from api.cli.console import as_json_text, emit, message, progress, say, show, table
-from api.cli.errors import CommandError, UsageError
+from api.cli.errors import CommandError
 from api.cli.files import read_bounded
 from api.cli.master_keys import FILES, opened_store
 from api.cli.new_key import show_once
 from api.cli.options import STORE, AsJson, Tenant, takes_settings
+from api.cli.public_key import read_public_key
 from api.http.audit import operator
-from api.http.receipts import read_receipt_keys, verify_answer
+from api.http.receipts import verify_answer
 from api.process.opening import open_contract, open_keyring
 from api.settings import Settings
 from templates.contract.canonical import parse_object
 from templates.errors import StoreError
 from templates.store.api_keys import ApiKey, Right
 from templates.store.identifiers import utc_now
-from templates.store.receipts import ReceiptKey
+from templates.store.receipts import key_fingerprint
 
 MAX_JSON_BYTES = 2**20
 
@@ -204,8 +205,7 @@ def rotate_tenant(
     """Give a tenant a new rotation key, and turn its stored templates by it.
 
     Nobody has to enroll again, and the service may run meanwhile; the old key is dropped at the
-    end. Only a template that its holder keeps cannot be turned: its subject is listed, and keeps
-    the old key until it is enrolled again. That is enough if only that key may have leaked. A
+    end. That is enough if only that key may have leaked. A
     stolen template stays a credential whatever happens to ours: with `--stolen`, only people
     enrolled from now on get the new key; the others are listed, and verified as before until they
     enroll again with new photos. Run it with `--stolen --finish` to see who is left, and again when
@@ -266,42 +266,27 @@ def verify_receipt(
     ],
     as_json: AsJson = False,
 ) -> None:
-    """Verify an erasure receipt, and tell under which key; exit status 1 if it is not valid.
+    """Verify an erasure receipt; exit status 1 if it is not valid.
 
-    Needs no service and no other key: take `GET /v1/contract` once, which names the key in force
-    and the retired ones, and keep it with the receipts. A receipt under a retired key is valid only
-    if it is dated before that. Whoever took that key can date one back; the deployment has signed
-    what it keeps again, and answers a second DELETE with it.
+    Needs no service and no other key: take `GET /v1/contract` once, which names the public key, and
+    keep it with the receipts. After `keys renew` a receipt from before is no longer valid: a second
+    DELETE answers with one under the new key.
 
     Example: `veilface keys verify-receipt receipt.json --public-key contract.json`
     """
-    keys = _receipt_keys(public_key)
+    key = read_public_key(public_key)
     answer = parse_object(read_bounded(receipt, MAX_JSON_BYTES), what="the receipt")
     try:
-        claims, key = verify_answer(answer, keys)
+        claims = verify_answer(answer, key)
     except StoreError as error:
         if as_json:
             emit({"valid": False, "reason": str(error)})
         message(f"error: {error}")
         raise typer.Exit(1) from None
     if as_json:
-        emit(
-            {
-                "valid": True,
-                "claims": claims,
-                "key_id": key.key_id,
-                "key_retired_at": _iso(key.retired_at),
-            }
-        )
-        return
-    _say_claims(claims)
-    if key.retired_at is None:
-        say(f"Signed with the key {key.key_id}.")
+        emit({"valid": True, "claims": claims, "key_id": key_fingerprint(key)})
     else:
-        say(
-            f"Signed with the key {key.key_id}, which was retired on {_iso(key.retired_at)}: "
-            "erase again for a receipt under the key in force."
-        )
+        _say_claims(claims)
 
 
 def _say_claims(claims: dict[str, Any]) -> None:
@@ -316,21 +301,6 @@ def _say_claims(claims: dict[str, Any]) -> None:
     verb = "erased" if claims["held"] else "stated"
     say(f"Valid: tenant {claims['tenant']} {verb} {content} a subject on {claims['erased_at']}.")
     say(f"The subject's pseudonym is {claims['subject']}.")
-
-
-def _receipt_keys(text: str) -> list[ReceiptKey]:
-    """Read base64, or the file of a contract."""
-    path = Path(text)
-    entry: Any = {"public_key": text}
-    if path.is_file():
-        document = parse_object(read_bounded(path, 256 * MAX_JSON_BYTES), what="the contract")
-        entry = document.get("receipt_key")
-    try:
-        return read_receipt_keys(entry)
-    except StoreError:
-        raise UsageError(
-            "--public-key takes base64, or a file with the JSON of GET /v1/contract"
-        ) from None
 
 
 def _state(key: ApiKey) -> str:

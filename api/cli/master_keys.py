@@ -15,7 +15,6 @@ from api.process.opening import file_sealer, open_keyring, open_store, prepare_d
 from api.settings import Settings
 from templates.contract.document import Contract
 from templates.decoys import DecoyPool, load_source
-from templates.keys.key_file import locked
 from templates.keys.sealing import MasterKeyring
 from templates.store import TemplateStore
 
@@ -56,10 +55,10 @@ def rotate(*, settings: Settings, retire: Retire = False, as_json: AsJson = Fals
     Example: `veilface keys rotate --retire`
     """
     _require_file(settings, "put a new key in front where they come from, then `keys rewrap`")
-    path = settings.resolved_master_key_file
-    with alone(settings):
-        MasterKeyring.add_current(path)
-        _rewrap(settings, retire=retire, as_json=as_json)
+    keyring = open_keyring(settings)
+    with opened_store(settings, keyring) as store:
+        add_key(settings, store)
+        _rewrap(settings, keyring, store, retire=retire, as_json=as_json)
 
 
 @takes_settings(*FILES)
@@ -72,8 +71,9 @@ def rewrap(*, settings: Settings, retire: Retire = False, as_json: AsJson = Fals
     """
     if retire:
         _require_file(settings, "drop the old key where they come from")
-    with alone(settings):
-        _rewrap(settings, retire=retire, as_json=as_json)
+    keyring = open_keyring(settings)
+    with opened_store(settings, keyring) as store:
+        _rewrap(settings, keyring, store, retire=retire, as_json=as_json)
 
 
 @contextmanager
@@ -96,18 +96,16 @@ def _require_file(settings: Settings, remedy: str) -> None:
 
 def is_from_file(settings: Settings) -> bool:
     """Whether the master keys are in a file, which commands may change."""
-    return settings.master_key_variable is None and settings.master_key_command is None
+    return settings.master_key_variable is None
 
 
-@contextmanager
-def alone(settings: Settings) -> Iterator[None]:
-    """Keep other rotations of the same key file out."""
-    if not is_from_file(settings):
-        yield
-        return
-    open_keyring(settings)  # it makes the file of a deployment that has none yet
-    with locked(settings.resolved_master_key_file):
-        yield
+def add_key(settings: Settings, store: TemplateStore) -> None:
+    """Put a new key in front of the key file's keys.
+
+    In a write, so that of two rotations at once neither takes the other's key out of the file.
+    """
+    path = settings.resolved_master_key_file
+    store.database.write(lambda _: MasterKeyring.add_current(path))
 
 
 @dataclass(frozen=True)
@@ -140,22 +138,28 @@ def rewrap_all(settings: Settings, keyring: MasterKeyring, store: TemplateStore)
     return Rewrapped(current, changed, _seal_files_again(settings, keyring), not left)
 
 
-def retire_older(settings: Settings, rewrapped: Rewrapped) -> int:
+def retire_older(settings: Settings, store: TemplateStore, rewrapped: Rewrapped) -> int:
     """Drop the older keys from the key file; returns how many."""
     if not rewrapped.is_complete:
         raise CommandError(
             "something is still wrapped by an older master key; run `veilface keys rewrap` "
             "again before retiring it"
         )
-    return MasterKeyring.drop_retired(settings.resolved_master_key_file, keep=rewrapped.key_id)
+    path = settings.resolved_master_key_file
+    return store.database.write(lambda _: MasterKeyring.drop_retired(path, keep=rewrapped.key_id))
 
 
-def _rewrap(settings: Settings, *, retire: bool, as_json: bool) -> None:
-    keyring = open_keyring(settings)
-    with opened_store(settings, keyring) as store:
-        rewrapped = rewrap_all(settings, keyring, store)
+def _rewrap(
+    settings: Settings,
+    keyring: MasterKeyring,
+    store: TemplateStore,
+    *,
+    retire: bool,
+    as_json: bool,
+) -> None:
+    rewrapped = rewrap_all(settings, keyring, store)
     current, changed, files = rewrapped.key_id, rewrapped.changed, rewrapped.files
-    dropped = retire_older(settings, rewrapped) if retire else 0
+    dropped = retire_older(settings, store, rewrapped) if retire else 0
     if as_json:
         emit(
             {

@@ -27,7 +27,6 @@ STORE = (
     "database_url",
     "master_key_file",
     "master_key_variable",
-    "master_key_command",
 )
 LOCAL = (*STORE, "contract_file", "decoys_file", "pack", "providers", "onnx_threads")
 

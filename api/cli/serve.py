@@ -15,7 +15,6 @@ from api.cli.errors import CommandError
 from api.cli.new_key import show_once
 from api.cli.options import takes_settings
 from api.cli.verdict import private_mode_weakness, verdict_lines
-from api.http.audit_report import open_audit_report
 from api.limits.rates import RateLimits
 from api.process.metrics import shared_directory
 from api.process.opening import key_beside_database, require_privacy
@@ -115,7 +114,6 @@ def _opened_once(settings: Settings, *, check: bool) -> tuple[Contract, bool]:
     """
     tls_options(settings)
     RateLimits.open(settings)
-    open_audit_report(settings)
     if check or settings.workers == 1 or settings.pack is None:
         opened = settings
     else:

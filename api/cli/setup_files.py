@@ -39,11 +39,9 @@ def report_master_key(made: dict[str, str], settings: Settings) -> None:
 
 
 def master_key_source(settings: Settings) -> str:
-    """Name the setting that the master key comes from; a command may hold a secret itself."""
+    """Name the place that the master key comes from."""
     if settings.master_key_variable is not None:
         return f"of the variable {settings.master_key_variable}"
-    if settings.master_key_command is not None:
-        return "of the setting master_key_command"
     return str(settings.resolved_master_key_file)
 
 

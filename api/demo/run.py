@@ -25,7 +25,7 @@ from api.demo.people import ENROLLED_PHOTOS, PROBE_PHOTOS, Cast, Scale, drawn_ca
 from api.demo.service import running_service
 from api.demo.storage import KEY_FILE, Stored, read_stored, rows_of
 from api.http.errors import StartError
-from api.http.receipts import read_receipt_keys, verify_answer
+from api.http.receipts import read_receipt_key, verify_answer
 from api.process.opening import file_sealer, weak_privacy
 from api.process.preparation import calibrate_folder, default_probe_dims, make_generator
 from api.process.settings_file import settings_text
@@ -399,8 +399,8 @@ def _erase(client: httpx.Client, name: str, photo: Path) -> tuple[dict[str, Any]
     answer = client.delete(f"/v1/subjects/{name}")
     if answer.status_code != httpx.codes.OK:
         return {}, [f"{name} was not erased: {_code(answer)}"]
-    keys = read_receipt_keys(client.get("/v1/contract").json()["receipt_key"])
-    claims, _ = verify_answer(answer.json(), keys)
+    public_key = read_receipt_key(client.get("/v1/contract").json()["receipt_key"])
+    claims = verify_answer(answer.json(), public_key)
     if not claims["held"]:
         faults.append("the receipt says that nothing was held")
     again = _send(client, "POST", f"/v1/subjects/{name}/verify", [photo])

@@ -162,7 +162,7 @@ async def _require_token(
     token.require(route, request.path_params.get("subject_id"))
     if route not in USES:
         # Those look for themselves, in the transaction that uses it up too.
-        await gate.query(lambda: runtime.store.nonces.require_unused(token.nonce))
+        await gate.query(lambda: runtime.store.audit_log.require_unused(token.digest))
 
 
 def note_subject(request: Request, pseudonym: str) -> None:

@@ -1,21 +1,23 @@
 """Challenges: sealed, self-contained ids, so that any worker knows one and nothing is stored of it.
 
-Its nonce is used up by the decision, in the decision's transaction.
+It is used up by the decision, in the decision's transaction.
 """
 
 import base64
 import binascii
 import json
 import secrets
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
 from api.http.bodies import parse_json
 from api.http.errors import ApiError
+from api.http.tokens import SubjectToken
 from api.http.values import in_time
 from templates.errors import SealError
 from templates.keys.sealing import MasterKeyring
-from templates.store.lockout import Nonce, Replayed
+from templates.store.audit_log import token_digest
+from templates.store.lockout import Replayed
 from verify import Movement, draw_movements
 
 FIELD = "challenge_id"
@@ -26,15 +28,24 @@ _PURPOSE = "challenge"
 
 @dataclass(frozen=True)
 class Challenge:
-    """What was asked, and what keeps it from a second use."""
+    """What was asked, and what keeps it from a second use.
+
+    Attributes
+    ----------
+    movements
+        What the person is asked to do.
+    digest
+        What the decision uses up: the token's own, where a token asked for the challenge.
+    is_of_token
+        Whether one did.
+    expires_at
+        When its frames come too late.
+    """
 
     movements: tuple[Movement, ...]
-    nonce: Nonce
-
-    @property
-    def expires_at(self) -> datetime:
-        """When its frames come too late."""
-        return self.nonce.expires_at
+    digest: str
+    is_of_token: bool
+    expires_at: datetime
 
 
 def new_challenge(
@@ -43,7 +54,7 @@ def new_challenge(
     tenant: str,
     key_prefix: str,
     subject: str | None,
-    token_nonce: Nonce | None = None,
+    token: SubjectToken | None = None,
 ) -> tuple[str, Challenge]:
     """Draw a challenge; return its id and what it asks.
 
@@ -52,24 +63,21 @@ def new_challenge(
     tenant
         The only one whose keys can answer it.
     key_prefix
-        Of the key that asks for it, under which its nonce is kept, whichever key answers.
+        Of the key that asks for it.
     subject
         The only one that it can be answered for; None for any.
-    token_nonce
-        Of the token that it is asked for with: one decision uses up both. The challenge ends no
-        later than the token.
+    token
+        That it is asked for with: one decision uses up both. The challenge ends no later than it.
     """
     expires = datetime.now(UTC).replace(microsecond=0) + LIFETIME
-    if token_nonce is None:
-        nonce = Nonce(key_prefix, secrets.token_urlsafe(18), expires)
-    else:
-        expires = min(expires, token_nonce.expires_at)
-        nonce = replace(token_nonce, expires_at=expires)
-    challenge = Challenge(draw_movements(), nonce)
+    digest = token_digest(key_prefix, secrets.token_urlsafe(18))
+    if token is not None:
+        expires, digest = min(expires, token.expires_at), token.digest
+    challenge = Challenge(draw_movements(), digest, token is not None, expires)
     body = {
         "movements": [str(movement) for movement in challenge.movements],
-        "key": key_prefix,
-        "nonce": nonce.value,
+        "digest": digest,
+        "token": challenge.is_of_token,
         "expires": int(expires.timestamp()),
         "subject": subject,
     }
@@ -97,7 +105,7 @@ def opened_challenge(
     try:
         padded = challenge_id.encode("ascii") + b"=" * (-len(challenge_id) % 4)
         sealed = base64.b64decode(padded, altchars=b"-_", validate=True)
-        body = parse_json(keyring.open(sealed, purpose=_PURPOSE, bound_to=[tenant], refresh=False))
+        body = parse_json(keyring.open(sealed, purpose=_PURPOSE, bound_to=[tenant]))
     except (SealError, binascii.Error, ValueError):
         raise unknown from None
     if body["subject"] not in (None, subject):
@@ -109,4 +117,4 @@ def opened_challenge(
             f"arrive within {LIFETIME.seconds} s; ask for another one"
         )
     movements = tuple(Movement(movement) for movement in body["movements"])
-    return Challenge(movements, Nonce(body["key"], body["nonce"], expires))
+    return Challenge(movements, body["digest"], body["token"], expires)

@@ -24,7 +24,6 @@ from api.http.challenges import FIELD as CHALLENGE
 from api.http.challenges import MAX_ID, Challenge, opened_challenge
 from api.http.errors import ApiError
 from api.http.holder_keys import FIELD, holder_key_of
-from api.http.tokens import is_of_token
 from api.http.values import (
     embedding_of,
     embeddings_of,
@@ -34,7 +33,6 @@ from api.process.metrics import step
 from api.process.runtime import Runtime
 from api.settings import Settings
 from templates.space.agreement import distinct_rows
-from templates.store.lockout import Nonce
 from verify import (
     MAX_FRAMES,
     MAX_PROBE_PHOTOS,
@@ -55,7 +53,7 @@ class Probe:
 
     kind: Literal["photo", "frames", "embedding", "template"]
     compare: Callable[[Verifier, OpenedTemplate], Decision]
-    nonce: Nonce | None
+    token: str | None
     holder_key: bytearray | None = field(repr=False)
 
 
@@ -103,7 +101,7 @@ async def _photos(
         challenge = opened_challenge(
             runtime.keyring, challenge_id, tenant=caller.tenant, subject=subject
         )
-    nonce = _nonce(caller, challenge)
+    token = _one_use(caller, challenge)
     embed: Callable[[Verifier], PhotoProbe]
     if challenge is None:
 
@@ -141,13 +139,13 @@ async def _photos(
     return Probe(
         "photo" if challenge is None else "frames",
         compare,
-        nonce,
+        token,
         holder_key,
     )
 
 
-def _nonce(caller: Caller, challenge: Challenge | None) -> Nonce | None:
-    """Return what a decision uses up, if anything.
+def _one_use(caller: Caller, challenge: Challenge | None) -> str | None:
+    """Return the digest of what a decision uses up, if anything.
 
     Raises
     ------
@@ -156,19 +154,17 @@ def _nonce(caller: Caller, challenge: Challenge | None) -> Nonce | None:
         or was not, and comes with one. A decision under an API key, at whatever level it asks for,
         must not be taken for the token's.
     """
-    token = None if caller.subject_token is None else caller.subject_token.nonce
+    token = None if caller.subject_token is None else caller.subject_token.digest
     if challenge is None:
         return token
-    if token is None and not is_of_token(challenge.nonce):
-        return challenge.nonce
-    if token is None or challenge.nonce.value != token.value:
+    if token != (challenge.digest if challenge.is_of_token else None):
         raise ApiError(
             "validation_failed",
             "a challenge is answered with the token that it was asked for with, and one of an API "
             "key with an API key: ask for one with what you send",
             {"field": CHALLENGE},
         )
-    return token
+    return challenge.digest
 
 
 def _check_count(count: int, settings: Settings, *, is_challenge: bool) -> None:
@@ -224,7 +220,7 @@ async def _numbers(
     return Probe(
         "template" if kind == "template" else "embedding",
         compare,
-        _nonce(caller, None),
+        _one_use(caller, None),
         holder_key,
     )
 

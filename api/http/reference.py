@@ -24,7 +24,6 @@ CURL: Mapping[str, str] = {
     "  -F images=@alice-1.jpg -F images=@alice-2.jpg $URL/v1/subjects/alice/enrollment",
     "listSubjects": 'curl -H "$AUTH" "$URL/v1/subjects?limit=10"',
     "getSubject": 'curl -H "$AUTH" $URL/v1/subjects/alice',
-    "getAudit": 'curl -H "$AUTH" $URL/v1/contract/audit',
     "verify": 'curl -H "$AUTH" -F image=@alice-3.jpg $URL/v1/subjects/alice/verify',
     "exportSubject": 'curl -H "$AUTH" -o export.json $URL/v1/subjects/alice/export',
     "importSubject": "python3 -c \"import json; e = json.load(open('export.json'))['export']; "

@@ -103,7 +103,7 @@ class VerifyAnswer(_Answer):
     fmr: float = Field(description="False match rate of the level.", examples=[0.001])
     contract_id: str = Field(examples=[HEX])
     calibration_id: str = Field(examples=[HEX])
-    distance: float | None = Field(None, description="Only for keys with the right `scores`.")
+    distance: float | None = Field(None, description="Only for keys with `scores` and `enroll`.")
     liveness_failure: (
         Literal[
             "not_frontal",
@@ -115,7 +115,7 @@ class VerifyAnswer(_Answer):
             "passive",
         ]
         | None
-    ) = Field(None, description="Why liveness failed: only for keys with `scores`.")
+    ) = Field(None, description="Why liveness failed: only for keys with `scores` and `enroll`.")
     advice: str | None = Field(
         None,
         description="What to change in another photo, after `no_match`: by the photo alone, "
@@ -219,23 +219,15 @@ class SubjectsAnswer(_Answer):
 
 
 class AuditLine(_Shape):
-    """One line of the audit log: who did what to which subject, and with which result.
+    """One line of the audit log: who did what to which subject, and with which result."""
 
-    Of a line that was altered there is its number, and nothing else.
-    """
-
-    at: str | None = Field(examples=["2026-01-31T12:00:00Z"])
-    actor: str | None = Field(description="Of a request, its key.", examples=["key:0f3a5c7e9b1d"])
-    action: str | None = Field(examples=["verify"])
+    at: str = Field(examples=["2026-01-31T12:00:00Z"])
+    actor: str = Field(description="Of a request, its key.", examples=["key:0f3a5c7e9b1d"])
+    action: str = Field(examples=["verify"])
     subject: str | None = Field(description="Pseudonym of the subject.", examples=[HEX])
-    outcome: str | None = Field(examples=["accept"])
+    outcome: str = Field(examples=["accept"])
     detail: str | None = Field(examples=["fmr-1e-3"])
     request_id: str | None
-    altered: bool = Field(
-        description="True: not as it was written; run `veilface audit-log verify`.",
-        examples=[False],
-    )
-    sequence: int | None = Field(description="Number of an altered line; null for others.")
 
 
 class AuditLogAnswer(_Answer):
@@ -320,21 +312,12 @@ class ImportAnswer(_Answer):
     holder_key: bool = Field(description="It accepts nobody without the holder's key.")
 
 
-class RetiredReceiptKey(_Shape):
-    """A key that receipts were signed with until it was retired."""
-
-    key_id: str
-    public_key: str = Field(description="32 bytes, base64.")
-    retired_at: str = Field(examples=["2026-01-31T12:00:00.000000+00:00"])
-
-
 class ReceiptKey(_Shape):
-    """The key that receipts are verified with, and those before it, the latest first."""
+    """The key that receipts are verified with."""
 
     algorithm: Literal["Ed25519"]
     key_id: str
     public_key: str = Field(description="32 bytes, base64.")
-    retired: list[RetiredReceiptKey]
 
 
 class ContractAnswer(_Answer):
@@ -398,58 +381,6 @@ class PhotoCheckAnswer(_Answer):
         description="x1, y1, x2, y2 of the face in pixels of the upright photo, if usable."
     )
     quality: dict[str, float | None] = Field(description="What was measured, if usable.")
-
-
-class AuditCell(_Shape):
-    """The strongest attack on one property by one kind of attacker."""
-
-    property: str
-    leaked: str = Field(description="What was stolen: `database`, `master key` or `holder keys`.")
-    knowledge: str
-    attack: str
-    variant: str | None
-    value: float
-    ci_low: float | None
-    ci_high: float | None
-    chance: float | None
-    compared: float = Field(
-        description="What stands against the limit: the value, its distance from chance "
-        "(confidentiality), or its excess over chance (unlinkability, a number and no share)."
-    )
-    compared_low: float | None
-    compared_high: float | None
-    limit: str | None = Field(description="Name of the limit.")
-    most: float = Field(description="The limit; 1 limits nothing.")
-    status: str | None
-    reason: str | None = Field(description="Why no limit is set; null where there is one.")
-
-
-class AuditLimit(_Shape):
-    """What the operator accepts."""
-
-    name: str
-    most: float
-    meaning: str
-
-
-class AuditAnswer(_Answer):
-    """The figures of the audit's report, as far as they concern this contract."""
-
-    audited: bool = Field(description="False: the operator named no report.")
-    fits: Literal["contract", "scheme", "nothing"] = Field(
-        description="What the report is about: this contract, with these or earlier thresholds; "
-        "its embedder, strategy, dimension and kind of decoys only; or something else."
-    )
-    kind: str | None = Field(examples=["templates"])
-    passed: bool | None = Field(
-        description="Of this scheme; null where no attack on it was judged, so that it neither "
-        "passed nor failed, and where the report fits nothing."
-    )
-    headlines: list[str] = Field(description="Those on this scheme.")
-    strongest: AuditCell | None
-    cells: list[AuditCell]
-    limits: list[AuditLimit]
-    command: str = Field(description="What makes a report for this contract.")
 
 
 class HealthAnswer(_Answer):

@@ -1,7 +1,7 @@
 """Subject tokens: what a browser holds in place of an API key, for one call of one subject.
 
 A token is sealed under the master key and bound to the row of the API key that asked for it, so
-that any worker knows it and nothing is stored of it. Its nonce is used up with what it is for, in
+that any worker knows it and nothing is stored of it. It is used up with what it is for, in
 the same transaction.
 """
 
@@ -19,14 +19,14 @@ from api.http.values import in_time
 from templates.errors import SealError
 from templates.keys.api_token import SUBJECT_TOKEN
 from templates.keys.sealing import MasterKeyring
-from templates.store.lockout import Nonce, Replayed
+from templates.store.audit_log import token_digest
+from templates.store.lockout import Replayed
 from templates.store.subjects import Precondition
 
 Action = Literal["verify", "enroll"]
 ACTIONS: tuple[Action, ...] = get_args(Action)
 LONGEST_S = 120
 _PURPOSE = "subject-token"
-_NONCE = "token:"
 
 CALLS: dict[str, frozenset[Action]] = {
     "enroll": frozenset({"enroll"}),
@@ -69,9 +69,9 @@ class SubjectToken:
     replace: bool = True
 
     @property
-    def nonce(self) -> Nonce:
-        """What a use of the token uses up."""
-        return nonce_of(self.key_prefix, self.token_id, self.expires_at)
+    def digest(self) -> str:
+        """What the audit log keeps of its use."""
+        return token_digest(self.key_prefix, self.token_id)
 
     @property
     def late(self) -> bool:
@@ -149,16 +149,6 @@ def _another(what: str, message: str) -> ApiError:
     return ApiError("forbidden", message, {"token": what})
 
 
-def nonce_of(key_prefix: str, token_id: str, expires_at: datetime) -> Nonce:
-    """Nonce of a token. No challenge's own is like it: those have no colon."""
-    return Nonce(key_prefix, f"{_NONCE}{token_id}", expires_at)
-
-
-def is_of_token(nonce: Nonce) -> bool:
-    """Whether it is a token's."""
-    return nonce.value.startswith(_NONCE)
-
-
 @dataclass(frozen=True)
 class NewToken:
     """A token that was just made; its text is shown once."""
@@ -218,7 +208,7 @@ def opened_token(keyring: MasterKeyring, text: str, *, key_id: str) -> SubjectTo
         return None
     try:
         sealed = base64.b64decode(match[2] + "=" * (-len(match[2]) % 4), b"-_", validate=True)
-        body = parse_json(keyring.open(sealed, purpose=_PURPOSE, bound_to=[key_id], refresh=False))
+        body = parse_json(keyring.open(sealed, purpose=_PURPOSE, bound_to=[key_id]))
     except (SealError, binascii.Error, ValueError):
         return None
     return SubjectToken(

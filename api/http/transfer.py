@@ -25,7 +25,6 @@ from templates.contract.canonical import Fields, Json, canonical_json, parse_obj
 from templates.errors import ContractError, ContractMismatch, InvalidTemplate, SealError
 from templates.keys.sealing import MasterKeyring
 from templates.store.identifiers import InvalidIdentifier
-from templates.store.secret import Secret
 from templates.store.subject_rows import Source
 
 MAGIC = b"VEILEXP1"
@@ -66,12 +65,9 @@ class ExportKey:
             raise StartError(f"the export key cannot be used: {error}") from error
 
     @classmethod
-    def from_secret(cls, secret: Secret) -> "ExportKey":
-        """Make the key from a secret of the deployment.
-
-        A retired value opens nothing: whoever stole it could have made the export.
-        """
-        keyring = MasterKeyring([secret.value], source="the deployment's export key")
+    def from_secret(cls, secret: bytes) -> "ExportKey":
+        """Make the key from a secret of the deployment, 32 bytes."""
+        keyring = MasterKeyring([secret], source="the deployment's export key")
         return cls(keyring, tenant_bound=True)
 
     @property

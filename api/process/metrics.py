@@ -167,7 +167,7 @@ def step(name: str) -> AbstractContextManager[object]:
     Parameters
     ----------
     name
-        A fixed text: ``body``, ``photo``, ``store``, ``decide``, … Each makes a series.
+        A fixed text: ``body``, ``photo``, ``decide``, … Each makes a series.
     """
     return STEP_SECONDS.labels(name).time()
 

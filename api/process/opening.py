@@ -4,7 +4,6 @@ Each function raises :class:`api.http.errors.StartError` with one sentence: whic
 what is wrong with it, and what to do.
 """
 
-import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import timedelta
@@ -26,7 +25,7 @@ from templates.store import TemplateStore
 from templates.store.database import Database
 from templates.store.lockout import LockoutPolicy
 from templates.store.retention import Retention
-from templates.store.schema import MasterKeyCheckRow
+from templates.store.schema import SecretRow
 
 
 def database_in_use(url: str) -> bool:
@@ -44,9 +43,9 @@ def database_in_use(url: str) -> bool:
     database = Database(url)
 
     def marked(connection: Connection) -> bool:
-        if not inspect(connection).has_table(MasterKeyCheckRow.__tablename__):
+        if not inspect(connection).has_table(SecretRow.__tablename__):
             return False
-        return connection.execute(select(MasterKeyCheckRow.id).limit(1)).first() is not None
+        return connection.execute(select(SecretRow.name).limit(1)).first() is not None
 
     try:
         return database.read(marked)
@@ -62,7 +61,7 @@ def file_sealer(keyring: MasterKeyring) -> KeyringSealer:
 def open_keyring(settings: Settings) -> MasterKeyring:
     """Load the master keys, or create the first one while nothing is stored yet.
 
-    They come from an environment variable, a command, or a file, whichever the settings name;
+    They come from an environment variable or a file, whichever the settings name;
     only the file is ever created.
 
     Raises
@@ -74,8 +73,6 @@ def open_keyring(settings: Settings) -> MasterKeyring:
     try:
         if settings.master_key_variable is not None:
             return MasterKeyring.from_environment(settings.master_key_variable)
-        if settings.master_key_command is not None:
-            return MasterKeyring.from_command(shlex.split(settings.master_key_command))
     except SealError as error:
         raise StartError(f"the master keys cannot be used: {error}") from None
     path = settings.resolved_master_key_file
@@ -92,7 +89,7 @@ def open_keyring(settings: Settings) -> MasterKeyring:
 
 def key_beside_database(settings: Settings) -> str | None:
     """Say that the master key lies in the folder of an SQLite database, or None."""
-    if settings.master_key_variable is not None or settings.master_key_command is not None:
+    if settings.master_key_variable is not None:
         return None
     url = make_url(settings.resolved_database_url)
     if url.get_backend_name() != "sqlite" or not url.database:

@@ -17,7 +17,6 @@ from typing import Literal
 from api.http.errors import ApiError
 from api.http.levels import Levels
 from api.http.liveness import LivenessRules
-from api.http.stand_ins import StandIns
 from api.http.transfer import Exported, ExportKey, seal_export
 from api.process.opening import (
     file_sealer,
@@ -30,6 +29,7 @@ from api.process.opening import (
     try_inference,
 )
 from api.process.served_graphs import served_graphs
+from api.process.stand_in import SealedStandIn
 from api.settings import Settings
 from enroll import Enroller, Enrollment
 from enroll.enroller import WIRE_DTYPE
@@ -43,8 +43,7 @@ from templates.keys.rotation import TenantRotation
 from templates.keys.sealing import MasterKeyring
 from templates.store import TemplateStore
 from templates.store.audit_log import By
-from templates.store.lockout import Nonce
-from templates.store.secret import SecretName
+from templates.store.secrets import SecretName
 from templates.store.subject_rows import Source, SubjectTemplate
 from templates.store.subjects import Precondition, StoredTemplate
 from templates.store.tenants import RetiredRotation
@@ -108,11 +107,8 @@ class Runtime:
         self.liveness = LivenessRules(self.settings.liveness, self.contract, self.pack)
         self.graphs = served_graphs(self.settings, self.pack)
         self.nobody = self.contract.nobody(self.source)
-        self.stand_ins = StandIns(
-            self.nobody,
-            self.keyring,
-            contract_id=self.contract.contract_id,
-            key=self._stand_in_key,
+        self.stand_in = SealedStandIn(
+            self.nobody, self.keyring, contract_id=self.contract.contract_id
         )
 
     @classmethod
@@ -139,9 +135,6 @@ class Runtime:
             try_inference(pack)
         store = open_store(settings, keyring)
         prepare_database(store)
-        # Obtained now, so that no request waits for it, nor fails on it.
-        for name in set(SecretName) - {SecretName.CHAIN}:
-            store.secrets.get(name)
         file = settings.export_key_file
         export_key = None if file is None else ExportKey.from_file(file)
         return cls(settings, keyring, store, contract, source, pack, export_key)
@@ -152,9 +145,6 @@ class Runtime:
         return self.operators_export_key or ExportKey.from_secret(
             self.store.secrets.get(SecretName.EXPORT)
         )
-
-    def _stand_in_key(self) -> bytes:
-        return self.store.secrets.get(SecretName.STAND_INS).value
 
     def epoch(self, tenant: str) -> int:
         """Return the epoch that the tenant's new templates are in."""
@@ -195,7 +185,7 @@ class Runtime:
                 self.contract,
                 self.source,
                 rotation=rotation,
-                lift_secret=self.store.secrets.get(SecretName.LIFTS).value,
+                lift_secret=self.store.secrets.get(SecretName.LIFTS),
             ),
             verifier=Verifier(self.contract, self.source, rotation=rotation),
         )
@@ -252,13 +242,13 @@ class Runtime:
         source: Source,
         photos: int,
         precondition: Precondition | None = None,
-        nonce: Nonce | None = None,
+        token: str | None = None,
         action: Literal["enroll", "import"] = "enroll",
         by: By,
     ) -> StoredTemplate:
         """Store an enrollment in place of an earlier one.
 
-        `precondition`, `nonce` and `action` are those of ``Subjects.put``.
+        `precondition`, `token` and `action` are those of ``Subjects.put``.
         """
         binding = self.contract.binding
         return self.store.subjects.put(
@@ -276,7 +266,7 @@ class Runtime:
             rotation_epoch=epoch,
             precondition=precondition,
             action=action,
-            nonce=nonce,
+            token=token,
             by=by,
         )
 

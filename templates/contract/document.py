@@ -34,8 +34,7 @@ from templates.contract.verdict import Verdict
 from templates.decoys import DecoySource, client_source
 from templates.distances import Metric
 from templates.errors import ContractError, SealError, Uncalibrated
-from templates.keys.bounded_file import read_at_most
-from templates.keys.private_file import replace_private
+from templates.keys.private_file import read_at_most, replace_private
 from templates.keys.randomness import KEY_BYTES
 from templates.keys.sealing import Sealer
 

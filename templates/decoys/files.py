@@ -4,8 +4,7 @@ import os
 from pathlib import Path
 
 from templates.errors import DecoyError
-from templates.keys.bounded_file import read_at_most
-from templates.keys.private_file import replace_private
+from templates.keys.private_file import read_at_most, replace_private
 
 
 def write_private(path: Path, data: bytes) -> None:

@@ -6,8 +6,7 @@ import re
 from pathlib import Path
 
 from templates.errors import SealError
-from templates.keys.bounded_file import read_private
-from templates.keys.private_file import create_private
+from templates.keys.private_file import create_private, read_private
 from templates.keys.randomness import KEY_BYTES
 
 # 32 bytes are 43 characters, of which the last has four bits: 16 of the 64 can end a key.

@@ -1,64 +1,62 @@
-"""Writing a file in one piece, and never where somebody else's link leads.
+"""Reading and writing files in one piece: private ones with mode 0600.
 
-A command that root runs often writes into a folder of the service's user. Who owns a folder can put
-a link in the place of the file, or of a folder above it, and would have root write where that user
-may not. So the folders on the way are opened one by one, and only links that root or we made are
-followed. A crash leaves the old file or the new.
+A crash leaves the old file or the new one. Root does not write over what another user owns: the
+service could not read it afterwards, and a user could have chosen the place.
 """
 
 import errno
 import os
 import pwd
 import stat
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+import tempfile
+from collections.abc import Callable
 from pathlib import Path
+from typing import BinaryIO
 
-_MAX_LINKS = 40  # as the kernel's own limit
-# Not to be listed but to be passed through, where the system knows the difference.
-_FOLDER = os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC | getattr(os, "O_PATH", os.O_RDONLY)
+from templates.errors import SealError
+
+_PIECE = 2**20
 
 
 def replace_private(path: Path, data: bytes) -> None:
     """Replace ``path`` at once by a file of mode 0600 that holds ``data``.
 
     The bytes are written beside the target and flushed to disk before the name changes, and the
-    folder is flushed after; folders that are missing are made. A link of root's or ours stays a
-    link, and the file keeps its owner where :func:`is_trusted` holds, so that a command which root
-    runs does not take a file away from the service. A file that a stranger put in the place is
-    replaced by one of our own.
+    folder is flushed after; folders that are missing are made. A link stays a link.
 
     Raises
     ------
     OSError
-        The file cannot be written or cannot be left to its owner; what is there is no regular
-        file; or a link of somebody else is on the way to it. Nothing is left beside the target.
+        The file cannot be written, or is another user's. Nothing is left beside the target.
     """
-    _replace(path, data, mode=0o600)
+    target = Path(os.path.realpath(path))
+    _write(path, target, data, mode=0o600, place=lambda draft: draft.replace(target))
 
 
 def replace_public(path: Path, data: bytes) -> None:
     """Replace a file as :func:`replace_private` does; the umask says who may read it."""
-    _replace(path, data, mode=0o666)
+    target, umask = Path(os.path.realpath(path)), os.umask(0)
+    os.umask(umask)
+    mode = 0o666 & ~umask
+    _write(path, target, data, mode=mode, place=lambda draft: draft.replace(target))
 
 
 def create_private(path: Path, data: bytes) -> None:
-    """Write a new file of mode 0600; folders that are missing are made with mode 0700.
+    """Write a new file of mode 0600.
 
     Raises
     ------
     FileExistsError
         There is a file, or a link, already.
     OSError
-        The file cannot be written, or a link of somebody else is on the way to it.
+        The file cannot be written.
     """
-    with _errors_name(path), _folder_of(path, mode=0o700) as (folder, name):
-        draft = _write_draft(name, data, folder=folder, mode=0o600, owner=None)
-        try:
-            os.link(draft, name, src_dir_fd=folder, dst_dir_fd=folder, follow_symlinks=False)
-        finally:
-            os.unlink(draft, dir_fd=folder)
-        _flush(folder)
+
+    def place(draft: Path) -> None:
+        path.hardlink_to(draft)
+        draft.unlink()
+
+    _write(path, path.parent.resolve() / path.name, data, mode=0o600, place=place)
 
 
 def make_folder(path: Path) -> None:
@@ -67,179 +65,118 @@ def make_folder(path: Path) -> None:
     Raises
     ------
     OSError
-        It cannot be made, or a link of somebody else is on the way to it.
+        It cannot be made.
     """
-    with _errors_name(path):
-        os.close(_entered(path))
+    path.mkdir(parents=True, exist_ok=True)
 
 
-def is_trusted(owner: int, folder_owner: int) -> bool:
-    """Whether what a user put into a folder is what the folder's owner, root or we want there."""
-    return owner in (os.geteuid(), 0, folder_owner)
-
-
-def follow_links(path: Path) -> Path:
-    """Return the file to read that a path leads to; a link of a stranger is not followed."""
-    for _ in range(_MAX_LINKS):
-        try:
-            status = path.lstat()
-        except FileNotFoundError:
-            return path
-        if not stat.S_ISLNK(status.st_mode):
-            return path
-        if not is_trusted(status.st_uid, path.parent.stat().st_uid):
-            return path
-        path = path.parent / path.readlink()
-    return path
-
-
-def user_name(number: int) -> str:
-    """Name a user for an error text, by the number where there is no name."""
-    try:
-        return f"{pwd.getpwuid(number).pw_name} ({number})"
-    except KeyError:
-        return str(number)
-
-
-def _replace(path: Path, data: bytes, *, mode: int) -> None:
-    with _errors_name(path), _folder_of(path, follow=True) as (folder, name):
-        owner = _owner_to_keep(name, folder)
-        draft = _write_draft(name, data, folder=folder, mode=mode, owner=owner)
-        try:
-            os.replace(draft, name, src_dir_fd=folder, dst_dir_fd=folder)
-        except BaseException:
-            os.unlink(draft, dir_fd=folder)
-            raise
-        _flush(folder)
-
-
-@contextmanager
-def _errors_name(path: Path) -> Iterator[None]:
-    """Put the whole path into an error, in place of the part of it that was looked at."""
-    try:
-        yield
-    except OSError as error:
-        raise OSError(error.errno, error.strerror, str(path)) from None
-
-
-@contextmanager
-def _folder_of(path: Path, *, mode: int = 0o777, follow: bool = False) -> Iterator[tuple[int, str]]:
-    """Open the folder of a file for the block; with ``follow``, of what a link there leads to."""
-    folder, name = _entered(path.parent, mode=mode), path.name
-    try:
-        for _ in range(_MAX_LINKS):
-            target = _linked(name, folder) if follow else None
-            if target is None:
-                break
-            further = _entered(target.parent, start=folder)
-            os.close(folder)
-            folder, name = further, target.name
-        yield folder, name
-    finally:
-        os.close(folder)
-
-
-def _entered(
-    path: Path, *, start: int | None = None, mode: int = 0o777, links: int = _MAX_LINKS
-) -> int:
-    """Open a folder part by part, make what is missing, and return its descriptor."""
-    if links == 0:
-        raise OSError(errno.ELOOP, os.strerror(errno.ELOOP))
-    folder = os.open(path.anchor or ".", _FOLDER, dir_fd=start)
-    try:
-        for name in path.relative_to(path.anchor).parts:
-            target = _linked(name, folder)
-            if target is None:
-                if _status(name, folder) is None:
-                    with suppress(FileExistsError):
-                        os.mkdir(name, mode, dir_fd=folder)
-                further = os.open(name, _FOLDER, dir_fd=folder)
-            else:
-                further = _entered(target, start=folder, mode=mode, links=links - 1)
-            os.close(folder)
-            folder = further
-    except BaseException:
-        os.close(folder)
-        raise
-    return folder
-
-
-def _linked(name: str, folder: int) -> Path | None:
-    """Return where a link leads; None for what is no link.
+def refuse_another_users(path: Path) -> None:
+    """Refuse to work as root on a file, or in a folder, that another user owns.
 
     Raises
     ------
     PermissionError
-        The link is neither root's nor ours, or changes while it is read.
+        It names the user to run this as.
     """
-    status = _status(name, folder)
-    if status is None or not stat.S_ISLNK(status.st_mode):
-        return None
-    if status.st_uid not in (os.geteuid(), 0):
-        raise PermissionError(
-            errno.EPERM,
-            f"there is a link of user {user_name(status.st_uid)} on the way, which is not "
-            "followed: name another place, or run this as that user",
-        )
-    target = os.readlink(name, dir_fd=folder)
-    again = _status(name, folder)
-    if again is None or (again.st_ino, again.st_ctime_ns) != (status.st_ino, status.st_ctime_ns):
-        raise PermissionError(errno.EPERM, "a link on the way was changed while it was followed")
-    return Path(target)
-
-
-def _status(name: str, folder: int) -> os.stat_result | None:
-    try:
-        return os.stat(name, dir_fd=folder, follow_symlinks=False)
-    except FileNotFoundError:
-        return None
-
-
-def _owner_to_keep(name: str, folder: int) -> os.stat_result | None:
-    status = _status(name or ".", folder)
-    if status is None:
-        return None
-    if not stat.S_ISREG(status.st_mode):
-        raise OSError(errno.EINVAL, "it is there and no regular file: name another one")
-    return status if is_trusted(status.st_uid, os.fstat(folder).st_uid) else None
-
-
-def _write_draft(
-    name: str, data: bytes, *, folder: int, mode: int, owner: os.stat_result | None
-) -> str:
-    """Write the bytes to a file beside the target, flush it to disk, and return its name."""
-    draft = f".{name}.{os.urandom(8).hex()}"
-    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
-    descriptor = os.open(draft, flags, mode, dir_fd=folder)
-    try:
-        with os.fdopen(descriptor, "wb") as file:
-            if owner is not None:
-                _give_to(file.fileno(), owner)
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-    except BaseException:
-        os.unlink(draft, dir_fd=folder)
-        raise
-    return draft
-
-
-def _flush(folder: int) -> None:
-    descriptor = os.open(".", os.O_RDONLY | os.O_CLOEXEC, dir_fd=folder)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def _give_to(descriptor: int, owner: os.stat_result) -> None:
-    if os.fstat(descriptor).st_uid == owner.st_uid:
+    if os.geteuid() != 0:
         return
-    try:
-        os.fchown(descriptor, owner.st_uid, owner.st_gid)
-    except OSError:
+    existing = next(place for place in (path, *path.parents) if place.exists())
+    owner = existing.stat().st_uid
+    if owner != 0:
+        try:
+            name = f"{pwd.getpwuid(owner).pw_name} ({owner})"
+        except KeyError:
+            name = str(owner)
         raise PermissionError(
-            errno.EPERM,
-            f"it belongs to user {user_name(owner.st_uid)} and could not stay theirs: "
-            "run this as that user, or as root",
-        ) from None
+            errno.EPERM, f"{existing} belongs to user {name}: run this as that user"
+        )
+
+
+def read_at_most(file: BinaryIO, most: int) -> bytes:
+    """Read a file, and stop one byte beyond ``most``.
+
+    ``file.read(most + 1)`` asks for all that memory even where the file is small: a limit of
+    gigabytes then fails under a limit of the process's address space.
+
+    Returns
+    -------
+    bytes
+        More than ``most`` bytes, by one, where the file is larger than that.
+
+    Raises
+    ------
+    OSError
+        The file cannot be read.
+    """
+    data = file.read(min(os.fstat(file.fileno()).st_size, most) + 1)
+    pieces, size = [data], len(data)
+    # A pipe states no size, and a file may grow while it is read.
+    while size <= most and (piece := file.read(min(_PIECE, most + 1 - size))):
+        pieces.append(piece)
+        size += len(piece)
+    return data if len(pieces) == 1 else b"".join(pieces)
+
+
+def read_private(path: Path, most: int, *, source: str, remedy: str, allowed: int = 0) -> bytes:
+    """Read a small file that nobody else may read.
+
+    Parameters
+    ----------
+    most
+        Bytes that it may have.
+    source, remedy
+        What messages call the file, and what to do where others may read it.
+    allowed
+        Bits of the mode for group and others that are no fault.
+
+    Raises
+    ------
+    SealError
+        If the file cannot be read, is no regular file, is too large, or others may read it.
+    """
+    try:
+        # Not blocking: a named pipe in the place of the file would hold the reader for ever.
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+        mode = os.fstat(descriptor).st_mode
+        if not stat.S_ISREG(mode):
+            os.close(descriptor)
+            raise SealError(f"{source} is not a regular file")
+        with os.fdopen(descriptor, "rb") as file:
+            data = read_at_most(file, most)
+    except OSError as error:
+        raise SealError(f"{source} cannot be read: {error.strerror}") from None
+    if mode & 0o077 & ~allowed:
+        raise SealError(f"{source} may be read by others (mode {stat.S_IMODE(mode):04o}): {remedy}")
+    if len(data) > most:
+        raise SealError(f"{source} has more than {most} bytes")
+    return data
+
+
+def _write(
+    path: Path, target: Path, data: bytes, *, mode: int, place: Callable[[Path], object]
+) -> None:
+    """Write a draft beside the target, flush it, and put it in its place."""
+    try:
+        if target.exists() and not target.is_file():
+            raise OSError(errno.EINVAL, "it is there and no regular file: name another one")
+        refuse_another_users(target)
+        target.parent.mkdir(mode=0o700 if mode == 0o600 else 0o777, parents=True, exist_ok=True)
+        descriptor, name = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
+        draft = Path(name)
+        try:
+            with os.fdopen(descriptor, "wb") as file:
+                os.fchmod(descriptor, mode)
+                file.write(data)
+                file.flush()
+                os.fsync(descriptor)
+            place(draft)
+        except BaseException:
+            draft.unlink()
+            raise
+        folder = os.open(target.parent, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from None

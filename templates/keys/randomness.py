@@ -56,7 +56,9 @@ class Keystream:
 
     @classmethod
     def seeded(cls, *parts: str | int) -> Self:
-        """Return the stream that belongs to ``parts``. For experiments, never for production.
+        """Return the stream that belongs to ``parts``, which anybody who knows them can make.
+
+        For evaluations and calibrations that must be repeatable, never for a secret.
 
         ``1`` and ``"1"`` are different parts, and ``("ab",)`` differs from ``("a", "b")``.
         """

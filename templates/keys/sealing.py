@@ -23,14 +23,12 @@ from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
 from templates.errors import SealError
-from templates.keys.key_command import KeyCommand
 from templates.keys.key_file import (
     KEY_BYTES,
     Stamp,
-    check_folder,
     check_keys,
+    check_place,
     keys_in,
-    locked,
     read_key_file,
     stamp_of,
     write_key_file,
@@ -86,11 +84,10 @@ def derive_key(key: bytes, label: str) -> bytes:
 class MasterKeyring:
     """The master keys of a deployment; the first seals, all of them open.
 
-    Use :meth:`load`, :meth:`create`, :meth:`from_command` or :meth:`from_environment`. A keyring
-    that came from a file follows the file: when it changes, the keys are read again at the next
-    seal, or when a blob names a key that is not in memory. So a running service picks up a rotation
-    without a restart. A command is run again only for a blob whose key is not in memory, and the
-    environment of a process never changes.
+    Use :meth:`load`, :meth:`create` or :meth:`from_environment`. A keyring that came from a file
+    follows the file: when it changes, the keys are read again at the next seal, or when a blob
+    names a key that is not in memory. So a running service picks up a rotation without a restart.
+    The environment of a process never changes.
 
     Parameters
     ----------
@@ -110,7 +107,6 @@ class MasterKeyring:
         self._path: Path | None = None
         self._stamp: Stamp | None = None
         self._not_followed: str | None = None
-        self._command: KeyCommand | None = None
         self._lock = threading.Lock()
         self._keys = _Keys(keys, source=source)
 
@@ -142,7 +138,7 @@ class MasterKeyring:
             If the file exists already or cannot be written.
         """
         path = Path(path)
-        check_folder(path)
+        check_place(path)
         write_key_file(path, [os.urandom(KEY_BYTES)], replace=False)
         return cls.load(path)
 
@@ -165,46 +161,22 @@ class MasterKeyring:
             )
         return cls(keys_in("\n".join(text.replace(",", " ").split()), source=source), source=source)
 
-    @classmethod
-    def from_command(cls, argv: Sequence[str], timeout_s: float = 30) -> Self:
-        """Ask a command, such as the client of a KMS, for the keys.
-
-        It writes one base64 key of 32 bytes on a line, the current one first. It is run now, and
-        again when a blob names a key that is not in memory, at most once in ten seconds.
-
-        Parameters
-        ----------
-        argv
-            Program and arguments; no shell is between.
-        timeout_s
-            Seconds until it is killed.
-
-        Raises
-        ------
-        SealError
-            If it fails, takes too long or writes anything but good keys.
-        """
-        command = KeyCommand(argv, timeout_s)
-        keyring = cls(command.ask(), source=command.source)
-        keyring._command = command
-        return keyring
-
     @staticmethod
     def add_current(path: str | Path) -> str:
         """Put a new random key in front of a key file's keys; returns its key id.
 
-        The file is replaced in one step. Afterwards re-wrap the store, then :meth:`drop_retired`.
+        The file is replaced in one step. Afterwards wrap the store again, then
+        :meth:`drop_retired`. Call both inside a write of the store: it keeps other rotations out.
 
         Raises
         ------
         SealError
-            If the file cannot be used or replaced, or somebody else changes it at this moment.
+            If the file cannot be used or replaced.
         """
         path = Path(path)
-        with locked(path):
-            keys, _ = read_key_file(path)
-            fresh = os.urandom(KEY_BYTES)
-            write_key_file(path, [fresh, *keys], replace=True)
+        keys, _ = read_key_file(path)
+        fresh = os.urandom(KEY_BYTES)
+        write_key_file(path, [fresh, *keys], replace=True)
         return _key_id(fresh).hex()
 
     @staticmethod
@@ -225,20 +197,19 @@ class MasterKeyring:
         Raises
         ------
         SealError
-            If another key is the first one by now, the file cannot be used or replaced, or
-            somebody else changes it at this moment. Then no key is dropped.
+            If another key is the first one by now, or the file cannot be used or replaced. Then
+            no key is dropped.
         """
         path = Path(path)
-        with locked(path):
-            keys, _ = read_key_file(path)
-            if (first := _key_id(keys[0]).hex()) != keep:
-                raise SealError(
-                    f"the first key of the key file {path} is {first}, but what was checked is "
-                    f"sealed under {keep}; the file changed meanwhile, and no key was dropped: "
-                    "run `veilface keys rewrap --retire`"
-                )
-            if len(keys) > 1:
-                write_key_file(path, keys[:1], replace=True)
+        keys, _ = read_key_file(path)
+        if (first := _key_id(keys[0]).hex()) != keep:
+            raise SealError(
+                f"the first key of the key file {path} is {first}, but what was checked is "
+                f"sealed under {keep}; the file changed meanwhile, and no key was dropped: "
+                "run `veilface keys rewrap --retire`"
+            )
+        if len(keys) > 1:
+            write_key_file(path, keys[:1], replace=True)
         return len(keys) - 1
 
     @property
@@ -255,13 +226,11 @@ class MasterKeyring:
 
     @property
     def stale_reason(self) -> str | None:
-        """Why the keys in memory may be old ones: the file or command that failed, and how.
+        """Why the keys in memory may be old ones: how reading the changed file failed.
 
-        They stay in use meanwhile. None where nothing failed, as far as it was tried.
+        They stay in use meanwhile. None where nothing failed.
         """
         self._follow_file()
-        if self._command is not None:
-            return None if self._command.failure is None else str(self._command.failure)
         return self._not_followed
 
     def seal(
@@ -287,23 +256,8 @@ class MasterKeyring:
         cipher = AESGCM(keys.derived(keys.ids[0], purpose))
         return header + nonce + cipher.encrypt(nonce, plaintext, _bind(header, purpose, bound_to))
 
-    def open(
-        self,
-        sealed: bytes,
-        *,
-        purpose: str,
-        bound_to: Sequence[str | bytes | int],
-        refresh: bool = True,
-    ) -> bytes:
+    def open(self, sealed: bytes, *, purpose: str, bound_to: Sequence[str | bytes | int]) -> bytes:
         """Decrypt what :meth:`seal` made with the same purpose and parts.
-
-        Parameters
-        ----------
-        sealed, purpose, bound_to
-            The blob, and what it was sealed with.
-        refresh
-            False for a blob that anybody may have made up: an unknown key in it does not run the
-            key command, which others would wait for. A key file is followed either way.
 
         Raises
         ------
@@ -314,14 +268,12 @@ class MasterKeyring:
         raw_id = bytes.fromhex(key_id)
         if raw_id not in self._keys.ids:
             self._follow_file()
-            if refresh:
-                self._follow_command(raw_id)
         keys = self._keys
         if raw_id not in keys.ids:
             known = ", ".join(own_id.hex() for own_id in keys.ids)
             raise SealError(
                 f"sealed under master key {key_id}, but {self._source} has only {known}: "
-                f"put the missing key back as a further line{self._last_failure()}"
+                "put the missing key back as a further line"
             )
         header, nonce = sealed[: 1 + KEY_ID_BYTES], sealed[1 + KEY_ID_BYTES :][:NONCE_BYTES]
         cipher = AESGCM(keys.derived(raw_id, purpose))
@@ -359,18 +311,6 @@ class MasterKeyring:
             self._not_followed = str(error)
         else:
             self._not_followed = None
-
-    def _follow_command(self, wanted: bytes) -> None:
-        if self._command is None:
-            return
-        with self._lock:
-            # Others may have asked while this thread waited.
-            if wanted not in self._keys.ids and (keys := self._command.ask_again()):
-                self._keys = _Keys(keys, source=self._source)
-
-    def _last_failure(self) -> str:
-        failure = None if self._command is None else self._command.failure
-        return "" if failure is None else f" (asked again, {failure})"
 
     def __repr__(self) -> str:
         return f"MasterKeyring({', '.join(key_id.hex() for key_id in self._keys.ids)})"

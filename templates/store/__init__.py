@@ -3,59 +3,41 @@
 Everything that a secret could be read from is encrypted; see ``docs/storage.md``.
 """
 
-from templates.store.api_keys import ApiKey, NewApiKey, Right
+from templates.store.api_keys import ApiKey, Right
 from templates.store.attempts import Attempt
-from templates.store.audit_chain import Anchor, Line, Problem, Verification
-from templates.store.audit_log import AuditLog, BrokenAuditLog, By, Entry
-from templates.store.erasure import Erasure
+from templates.store.audit_archive import Archive, verify_archive
+from templates.store.audit_log import Anchor, BrokenAuditLog, By, Entry, Line
 from templates.store.identifiers import InvalidIdentifier, UnknownTenant
-from templates.store.lockout import LockedOut, LockoutPolicy, Nonce, Replayed, Superseded
+from templates.store.lockout import AttemptsStatus, LockedOut, LockoutPolicy, Replayed
 from templates.store.receipts import Receipt, verify_receipt
 from templates.store.repository import TemplateStore
 from templates.store.retention import Retention
-from templates.store.standing import AttemptsStatus
-from templates.store.subject_rows import (
-    Source,
-    SubjectRecord,
-    SubjectTemplate,
-)
-from templates.store.subjects import StoredTemplate, SubjectPage
-from templates.store.tenant_erasure import TenantErasure
-from templates.store.tenants import RetiredRotation, RotationKey, Tenant
+from templates.store.subject_rows import Source
+from templates.store.subjects import StoredTemplate
+from templates.store.tenants import RetiredRotation
 
 __all__ = [
     "Anchor",
     "ApiKey",
+    "Archive",
     "Attempt",
     "AttemptsStatus",
-    "AuditLog",
     "BrokenAuditLog",
     "By",
     "Entry",
-    "Erasure",
     "InvalidIdentifier",
     "Line",
     "LockedOut",
     "LockoutPolicy",
-    "NewApiKey",
-    "Nonce",
-    "Problem",
     "Receipt",
     "Replayed",
     "Retention",
     "RetiredRotation",
     "Right",
-    "RotationKey",
     "Source",
     "StoredTemplate",
-    "SubjectPage",
-    "SubjectRecord",
-    "SubjectTemplate",
-    "Superseded",
     "TemplateStore",
-    "Tenant",
-    "TenantErasure",
     "UnknownTenant",
-    "Verification",
+    "verify_archive",
     "verify_receipt",
 ]

@@ -2,18 +2,21 @@
 
 A token is ``vf_<prefix>_<secret>``, 48 and 256 random bits in hexadecimal. The store keeps the
 prefix, to find the row, and the SHA-256 of the whole token: a secret of 256 random bits cannot be
-guessed from a fast hash.
+guessed from a fast hash. A row carries an HMAC, under a secret of the deployment, over everything
+that gives rights: so an attacker who can write the database, but has no master key, can neither
+make a key nor widen one. A row whose MAC is wrong is as good as none.
 """
 
 import contextlib
 import functools
 import hashlib
 import hmac
+import logging
 import os
 import uuid
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from datetime import datetime, timedelta
+from datetime import UTC, datetime, timedelta
 from enum import StrEnum
 from typing import Any
 
@@ -21,19 +24,20 @@ import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
 from templates.contract.levels import LEVEL_NAME
-from templates.errors import StoreError, StoreUnavailable
+from templates.errors import StoreError
 from templates.keys.api_token import TOKEN
+from templates.keys.sealing import encode_parts
 from templates.store.audit_log import PROGRAM, TENANT_ERASE, By, Entry
-from templates.store.authenticity import LAST_KEY_LINE, columns_of, is_current, row_mac, warn
 from templates.store.context import StoreContext
-from templates.store.schema import ApiKeyRow, AuditRow, TenantRow
-from templates.store.subject_rows import tenant_id_of
-from templates.store.tenants import Tenants
+from templates.store.schema import ApiKeyRow, AuditHeadRow, AuditRow, TenantRow
+from templates.store.secrets import SecretName
+from templates.store.tenants import Tenants, tenant_id_of
 
 MAX_LABEL = 128
 
 _NOBODYS_HASH = os.urandom(32)
 _USE_IS_NOTED_EVERY = timedelta(minutes=1)
+_logger = logging.getLogger("veilface.store")
 
 
 class Right(StrEnum):
@@ -57,7 +61,7 @@ class ApiKey:
     lowest_level
         Security level below which it does not verify; None for any.
     authentic
-        Whether its row is as this program left it. Else it is as good as none.
+        Whether the MAC of its row is good. Else it is as good as none.
     """
 
     id: str
@@ -84,17 +88,6 @@ class NewApiKey:
 
     key: ApiKey
     token: str = field(repr=False)
-
-
-@dataclass(frozen=True)
-class _Grant:
-    """What a key that is made is good for."""
-
-    tenant: str
-    rights: frozenset[Right]
-    label: str
-    expires_at: datetime | None = None
-    lowest_level: str | None = None
 
 
 class ApiKeys:
@@ -128,8 +121,8 @@ class ApiKeys:
             raise StoreError(f"a label has at most {MAX_LABEL} printable characters")
         if lowest_level is not None and not LEVEL_NAME.fullmatch(lowest_level):
             raise StoreError("the lowest level of a key is the name of a level, such as fmr-1e-4")
-        grant = _Grant(tenant, granted, label, expires_at, lowest_level)
-        return self._context.write(lambda connection: self._insert(connection, grant, by))
+        key = self._drawn(tenant, granted, label, expires_at, lowest_level)
+        return self._context.database.write(lambda connection: self._insert(connection, key, by))
 
     def bootstrap(
         self,
@@ -145,27 +138,26 @@ class ApiKeys:
         granted = _rights(rights)
 
         def work(connection: Connection) -> NewApiKey | None:
-            if _had_keys(connection):
+            had_keys = (
+                sa.select(ApiKeyRow.id).limit(1),
+                sa.select(AuditRow.sequence).where(AuditRow.action == TENANT_ERASE).limit(1),
+                sa.select(AuditHeadRow.id).where(AuditHeadRow.base_sequence > 0),
+            )
+            if any(connection.execute(query).first() is not None for query in had_keys):
                 return None
             self._tenants.ensure(connection, tenant)
-            return self._insert(connection, _Grant(tenant, granted, "bootstrap"), by)
+            return self._insert(connection, self._drawn(tenant, granted, "bootstrap"), by)
 
-        return self._context.write(work, lock="bootstrap")
+        return self._context.database.write(work)
 
     def verify(self, token: str) -> ApiKey | None:
         """Return the key of a token, or None if it is unknown, wrong, expired or revoked.
 
-        A key whose row is not authentic is as good as unknown. The comparison
-        takes the same time wherever the tokens differ, and an unknown prefix is compared too.
+        The comparison takes the same time wherever the tokens differ, and an unknown prefix is
+        compared too.
         """
         match = TOKEN.fullmatch(token)
-        prefix = match[1] if match else ""
-        try:
-            row = self._row(prefix)
-        except (ValueError, TypeError):
-            # SQLite keeps any value in any column.
-            warn("an API key's row is not authentic and was passed over", key_id=prefix)
-            return None
+        row = self._row(match[1] if match else "")
         expected = _NOBODYS_HASH if row is None else row.token_hash
         same = hmac.compare_digest(_token_hash(token), expected)
         key = self._valid(row) if same else None
@@ -174,26 +166,12 @@ class ApiKeys:
         return key
 
     def valid(self, prefix: str) -> ApiKey | None:
-        """Return the key of a prefix, or None where :meth:`verify` would return none.
+        """Return the key of a prefix if it is good now.
 
-        For what the service itself made under that key: whoever knows a prefix has no key. So the
-        use is not noted: see :meth:`note_use`.
+        For what the service itself made under that key: a caller who knows a prefix has no key. So
+        the use is not noted: see :meth:`note_use`.
         """
-        try:
-            row = self._row(prefix)
-        except (ValueError, TypeError):
-            warn("an API key's row is not authentic and was passed over", key_id=prefix)
-            return None
-        return self._valid(row)
-
-    def _valid(self, row: Any) -> ApiKey | None:
-        """Return the key of a row if it is good now."""
-        if row is None:
-            return None
-        key, now = self._read(row), self._context.clock()
-        if not key.authentic:
-            warn("an API key's row is not authentic and was passed over", key_id=key.prefix)
-        return key if key.is_valid_at(now) else None
+        return self._valid(self._row(prefix))
 
     def get(self, prefix: str) -> ApiKey | None:
         """Return a key by its prefix, or None."""
@@ -205,8 +183,12 @@ class ApiKeys:
         query = _KEYS.order_by(ApiKeyRow.created_at, ApiKeyRow.prefix)
         if tenant is not None:
             query = query.where(TenantRow.name == tenant)
-        rows = self._context.read(lambda connection: connection.execute(query).all())
+        rows = self._context.database.read(lambda connection: connection.execute(query).all())
         return tuple(self._read(row) for row in rows)
+
+    def read_all(self, connection: Connection) -> tuple[ApiKey, ...]:
+        """Every key, inside a transaction."""
+        return tuple(self._read(row) for row in connection.execute(_KEYS).all())
 
     def revoke(self, prefix: str, *, by: By = PROGRAM) -> bool:
         """Revoke a key for good; True unless it was unknown or revoked before.
@@ -215,37 +197,25 @@ class ApiKeys:
         """
 
         def work(connection: Connection) -> bool:
-            row = connection.execute(_LOCKED, {"prefix": prefix}).one_or_none()
+            row = connection.execute(_OF_PREFIX, {"prefix": prefix}).one_or_none()
             if row is None:
                 entry = Entry("key-revoke", "unknown_key", by)
-                self._context.audit_log.append(connection, entry)
-                return False
-            revoked = row.revoked_at is None
-            outcome = "revoked" if revoked else "revoked_before"
-            self._change(
-                connection,
-                row,
-                Entry("key-revoke", outcome, by, row.tenant, detail=prefix),
-                revoked_at=self._context.clock() if revoked else row.revoked_at,
-            )
-            return revoked
+            elif row.revoked_at is not None:
+                entry = Entry("key-revoke", "revoked_before", by, row.tenant, detail=prefix)
+            else:
+                entry = Entry("key-revoke", "revoked", by, row.tenant, detail=prefix)
+                self._change(connection, row, revoked_at=self._context.clock())
+            self._context.audit_log.append(connection, entry)
+            return entry.outcome == "revoked"
 
-        return self._context.write(work)
-
-    def revoke_all(self, connection: Connection, tenant: str, *, by: By) -> None:
-        """Revoke every key of a tenant inside a transaction that is open already."""
-        query = _KEYS.where(TenantRow.name == tenant, ApiKeyRow.revoked_at.is_(None))
-        rows = connection.execute(query.order_by(ApiKeyRow.id).with_for_update(of=ApiKeyRow)).all()
-        now = self._context.clock()
-        for row in rows:
-            entry = Entry("key-revoke", "revoked", by, tenant, detail=row.prefix)
-            self._change(connection, row, entry, revoked_at=now)
+        return self._context.database.write(work)
 
     def replace(self, prefix: str, *, grace: timedelta, by: By = PROGRAM) -> NewApiKey | None:
         """Make a key in place of another one, which stays valid for a while.
 
-        The new key has the tenant, rights, label, expiry and lowest level of the old one,
-        so replacing a key does not prolong or widen what was granted.
+        The new key has the tenant, rights, label, expiry and lowest level of the old one, so
+        replacing a key does not prolong or widen what was granted. The line of the audit log holds
+        the old key's prefix and when that ends.
 
         Parameters
         ----------
@@ -266,107 +236,150 @@ class ApiKeys:
 
         def work(connection: Connection) -> NewApiKey | None:
             now = self._context.clock()
-            row = connection.execute(_LOCKED, {"prefix": prefix}).one_or_none()
+            row = connection.execute(_OF_PREFIX, {"prefix": prefix}).one_or_none()
             old = None if row is None else self._read(row)
             if old is None or not old.is_valid_at(now):
                 return None
-            grant = _Grant(**{name: getattr(old, name) for name in _Grant.__dataclass_fields__})
-            new = self._insert(connection, grant, by)
-            self._change(
-                connection,
-                row,
-                Entry("key-replace", "replaced", by, old.tenant, detail=prefix),
-                expires_at=_sooner(old.expires_at, now, grace),
-            )
+            fresh = self._drawn(old.tenant, old.rights, old.label, old.expires_at, old.lowest_level)
+            new = self._insert(connection, fresh, by)
+            ends = _sooner(old.expires_at, now, grace)
+            self._change(connection, row, expires_at=ends)
+            detail = prefix if ends is None else f"{prefix} {ends.isoformat()}"
+            entry = Entry("key-replace", "replaced", by, old.tenant, detail=detail)
+            self._context.audit_log.append(connection, entry)
             return new
 
-        return self._context.write(work)
+        return self._context.database.write(work)
+
+    def authenticate_again(self, connection: Connection, secret: bytes) -> tuple[str, ...]:
+        """Give every authentic key a MAC under a new secret, in a write.
+
+        Returns the prefixes of the others, which are good for nothing from then on.
+        """
+        refused = []
+        rows: Any = connection.execute(_KEYS).all()
+        for row in rows:
+            if self._is_authentic(row):
+                mac = _mac(secret, row._mapping)
+                statement = sa.update(ApiKeyRow).where(ApiKeyRow.prefix == row.prefix)
+                connection.execute(statement.values(mac=mac))
+            else:
+                refused.append(row.prefix)
+        return tuple(refused)
+
+    def note_use(self, key: ApiKey) -> None:
+        """Note that a key is used: to the minute, so that not every request is a write.
+
+        A failure is passed over: a full, busy or read-only database must not refuse a good key.
+        """
+        now = self._context.clock()
+        if key.last_used_at is not None and key.last_used_at > now - _USE_IS_NOTED_EVERY:
+            return
+        statement = sa.update(ApiKeyRow).where(ApiKeyRow.id == key.id).values(last_used_at=now)
+        with contextlib.suppress(StoreError):
+            self._context.database.write(lambda connection: connection.execute(statement))
 
     def _row(self, prefix: str) -> Any:
-        return self._context.read(
+        return self._context.database.read(
             lambda connection: connection.execute(_OF_PREFIX, {"prefix": prefix}).one_or_none()
         )
 
-    def _insert(self, connection: Connection, grant: "_Grant", by: By) -> NewApiKey:
-        tenant_id = tenant_id_of(connection, grant.tenant)
-        key_id, prefix = uuid.uuid4().hex, os.urandom(6).hex()
-        key = ApiKey(id=key_id, prefix=prefix, created_at=self._context.clock(), **vars(grant))
-        token = f"vf_{prefix}_{os.urandom(32).hex()}"
-        entry = Entry("key-create", "created", by, key.tenant, detail=prefix)
-        row: dict[str, Any] = {
-            "id": key_id,
-            "tenant_id": tenant_id,
-            "prefix": prefix,
-            "token_hash": _token_hash(token),
-            "rights": ",".join(sorted(key.rights)),
-            "label": key.label,
-            "created_at": key.created_at,
-            "expires_at": key.expires_at,
-            "revoked_at": None,
-            "lowest_level": key.lowest_level,
-            "line": self._context.audit_log.append(connection, entry),
-        }
-        row_key = self._context.audit_log.row_key()
-        row["mac"] = row_mac(row_key, ApiKeyRow, {**row, "tenant": key.tenant})
-        connection.execute(sa.insert(ApiKeyRow).values(row))
-        return NewApiKey(key=key, token=token)
-
-    def _change(self, connection: Connection, row: Any, entry: Entry, **columns: object) -> None:
-        """Change columns of a row that is locked, and add the line that tells of it.
-
-        A row that is not authentic stays so: whatever else it holds must not be vouched for.
-        """
-        authentic = self._is_authentic(row)
-        columns["line"] = self._context.audit_log.append(connection, entry)
-        if authentic:
-            row_key = self._context.audit_log.row_key()
-            columns["mac"] = row_mac(row_key, ApiKeyRow, {**row._mapping, **columns})
-        statement = sa.update(ApiKeyRow).where(ApiKeyRow.prefix == row.prefix)
-        connection.execute(statement.values(columns))
-
-    def _is_authentic(self, row: Any) -> bool:
-        return is_current(self._context.audit_log.row_key(), ApiKeyRow, row._mapping)
+    def _valid(self, row: Any) -> ApiKey | None:
+        if row is None:
+            return None
+        key = self._read(row)
+        if not key.authentic:
+            _logger.warning(
+                "an API key's row is not authentic and was passed over",
+                extra={"fields": {"key_id": key.prefix}},
+            )
+        return key if key.is_valid_at(self._context.clock()) else None
 
     def _read(self, row: Any) -> ApiKey:
-        values = {name: row._mapping[name] for name in _KEY_COLUMNS}
+        values = {name: row._mapping[name] for name in _FIELDS}
         values["rights"] = _granted(row.rights)
         return ApiKey(**values, authentic=self._is_authentic(row))
 
-    def note_use(self, key: ApiKey) -> None:
-        """Note that a key is used: to the minute, so that not every request is a write."""
-        now = self._context.clock()
-        due = now - _USE_IS_NOTED_EVERY
-        if key.last_used_at is not None and key.last_used_at > due:
-            return
-        statement = (
-            sa.update(ApiKeyRow)
-            .where(
-                ApiKeyRow.id == key.id,
-                sa.or_(ApiKeyRow.last_used_at.is_(None), ApiKeyRow.last_used_at <= due),
-            )
-            .values(last_used_at=now)
+    def _is_authentic(self, row: Any) -> bool:
+        expected = _mac(self._context.secrets.get(SecretName.API_KEYS), row._mapping)
+        return hmac.compare_digest(expected, row.mac)
+
+    def _drawn(
+        self,
+        tenant: str,
+        rights: frozenset[Right],
+        label: str,
+        expires_at: datetime | None = None,
+        lowest_level: str | None = None,
+    ) -> ApiKey:
+        return ApiKey(
+            id=uuid.uuid4().hex,
+            prefix=os.urandom(6).hex(),
+            tenant=tenant,
+            rights=rights,
+            label=label,
+            created_at=self._context.clock(),
+            expires_at=expires_at,
+            lowest_level=lowest_level,
         )
-        # A full or busy disk must not refuse a good key.
-        with contextlib.suppress(StoreUnavailable):
-            self._context.database.write(lambda connection: connection.execute(statement))
+
+    def _insert(self, connection: Connection, key: ApiKey, by: By) -> NewApiKey:
+        token = f"vf_{key.prefix}_{os.urandom(32).hex()}"
+        row: dict[str, Any] = {
+            **{name: getattr(key, name) for name in _FIELDS - {"tenant"}},
+            "tenant_id": tenant_id_of(connection, key.tenant),
+            "token_hash": _token_hash(token),
+            "rights": ",".join(sorted(key.rights)),
+        }
+        secret = self._context.secrets.get(SecretName.API_KEYS)
+        row["mac"] = _mac(secret, {**row, "tenant": key.tenant})
+        connection.execute(sa.insert(ApiKeyRow).values(row))
+        entry = Entry("key-create", "created", by, key.tenant, detail=key.prefix)
+        self._context.audit_log.append(connection, entry)
+        return NewApiKey(key=key, token=token)
+
+    def _change(self, connection: Connection, row: Any, **columns: Any) -> None:
+        """Change columns of a row; one that is not authentic stays so."""
+        if self._is_authentic(row):
+            secret = self._context.secrets.get(SecretName.API_KEYS)
+            columns["mac"] = _mac(secret, {**row._mapping, **columns})
+        statement = sa.update(ApiKeyRow).where(ApiKeyRow.prefix == row.prefix)
+        connection.execute(statement.values(columns))
 
 
-_KEY_COLUMNS = set(ApiKey.__dataclass_fields__) - {"authentic"}
+_AUTHENTICATED = (
+    "id",
+    "tenant_id",
+    "tenant",
+    "prefix",
+    "token_hash",
+    "rights",
+    "expires_at",
+    "revoked_at",
+    "lowest_level",
+)
+"""What the MAC of a row covers; `tenant` is the name, which the tenant's own row could change."""
+_FIELDS = set(ApiKey.__dataclass_fields__) - {"authentic"}
 _KEYS: Any = sa.select(
-    *columns_of(ApiKeyRow),
+    *(column for column in ApiKeyRow.__table__.columns),
     TenantRow.name.label("tenant"),
-    LAST_KEY_LINE.label("last_line"),
-    ApiKeyRow.last_used_at,
 ).join(TenantRow, TenantRow.id == ApiKeyRow.tenant_id)
 _OF_PREFIX = _KEYS.where(ApiKeyRow.prefix == sa.bindparam("prefix"))
-_LOCKED = _OF_PREFIX.with_for_update(of=ApiKeyRow)
 
 
-def _had_keys(connection: Connection) -> bool:
-    """Whether there are keys, or were some that went with their tenant."""
-    keys = sa.select(ApiKeyRow.id).limit(1)
-    erased = sa.select(AuditRow.sequence).where(AuditRow.action == TENANT_ERASE).limit(1)
-    return any(connection.execute(query).first() is not None for query in (keys, erased))
+def _mac(secret: bytes, values: Mapping[str, Any]) -> bytes:
+    parts = [_part(values[name]) for name in _AUTHENTICATED]
+    return hmac.digest(secret, encode_parts("api key", *parts), hashlib.sha256)
+
+
+def _part(value: object) -> str | bytes | int:
+    match value:
+        case datetime():
+            return value.astimezone(UTC).isoformat(timespec="microseconds")
+        case str() | bytes():
+            return value
+        case _:
+            return 0  # NULL; no column that may be NULL holds a number
 
 
 def _sooner(expires_at: datetime | None, now: datetime, grace: timedelta) -> datetime | None:
@@ -380,8 +393,7 @@ def _sooner(expires_at: datetime | None, now: datetime, grace: timedelta) -> dat
 
 @functools.lru_cache(maxsize=256)
 def _granted(rights: str) -> frozenset[Right]:
-    """Rights of a row; those that there are, in one that somebody else wrote."""
-    return frozenset(right for right in Right if right in str(rights).split(","))
+    return frozenset(right for right in Right if right in rights.split(","))
 
 
 def _rights(rights: Iterable[Right | str]) -> frozenset[Right]:

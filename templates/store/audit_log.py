@@ -1,83 +1,105 @@
-"""The audit log: who did what to which subject, and with which result; lines are only ever added.
+"""The audit log: who did what to which subject, and with which result.
 
 A line names the subject by its pseudonym, and holds nothing of a face. It is written in the
 transaction of what it tells of: what is committed has its line, and what is rolled back has none.
-The chain that shows whether a line was altered, removed or moved is in
-``templates.store.audit_chain``; triggers of the database refuse to change or remove a line at all.
+
+The lines are a chain: the MAC of a line is an HMAC-SHA256, under a secret of the deployment, over
+its columns and the MAC of the line before. The head row holds both ends of the chain under a MAC.
+So an attacker who can write the database, but has no master key, can neither write a line nor cut
+lines off unseen. An older state of the whole database, head included, is a true one: only an
+:class:`Anchor` that was kept elsewhere shows it.
+
+A one-use token is used up by the line of its use (``AuditRow.token``).
 """
 
+import hashlib
+import hmac
 import re
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from datetime import datetime
-from functools import partial
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import Any
 
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
 from templates.errors import StoreError
-from templates.keys.sealing import derive_key
-from templates.store.audit_chain import (
-    START,
-    Anchor,
-    Chain,
-    Line,
-    LineKeys,
-    Verification,
-    head_mac,
-    is_head,
-    line_hash,
-    read_line,
-    true_line,
-)
-from templates.store.audit_rows import (
-    read_end,
-    read_head,
-    read_lines,
-    read_tenant_erasures,
-    read_tenant_lines,
-)
+from templates.keys.sealing import encode_parts
 from templates.store.database import Database
-from templates.store.deployment import Secrets
 from templates.store.identifiers import (
     Clock,
     InvalidIdentifier,
     checked_opaque_id,
     checked_tenant_name,
 )
+from templates.store.lockout import Replayed
 from templates.store.schema import AuditHeadRow, AuditRow
-from templates.store.secret import Secret, SecretName
+from templates.store.secrets import SecretName, Secrets
 
 BATCH = 1000
-SCANNED = 50_000
-MAX_ACTOR = 64
-MAX_REQUEST_ID = 64
-MAX_DETAIL = 64
-
+MAX_TEXT = 64
 TENANT_ERASE = "tenant-erase"
-RENEWAL = "secrets-renew"
 
-_BEGIN_LOCK = "veilface audit chain"
+_ANCHOR = re.compile(r"([0-9]{1,18}):([0-9a-f]{64})")
 _DIGEST = re.compile(r"[0-9a-f]{64}")
-# Made once: building a statement costs more than running it, and every write appends a line.
-_ADD_LINE = sa.insert(AuditRow.__table__)  # type: ignore[arg-type]
-_MOVE_HEAD = sa.update(AuditHeadRow.__table__)  # type: ignore[arg-type]
+_COLUMNS = tuple(column.key for column in AuditRow.__table__.columns)
+_HEAD = ("base_sequence", "base_mac", "sequence", "line_mac")
+
+
+def _check_text(text: str | None, what: str) -> None:
+    if text is not None and not (0 < len(text) <= MAX_TEXT and text.isprintable()):
+        raise InvalidIdentifier(
+            f"the {what} of an audit line is 1 to {MAX_TEXT} printable characters"
+        )
 
 
 class BrokenAuditLog(StoreError):
-    """The head of the audit log, or its key, is missing or forged, so no line can be added."""
+    """The head of the audit log is missing or forged, so no line can be added."""
 
 
-def is_digest(text: str) -> bool:
-    """Whether a text is 64 hexadecimal digits, as a pseudonym is."""
-    return _DIGEST.fullmatch(text) is not None
+@dataclass(frozen=True)
+class Anchor:
+    """A point of the chain, kept outside the database: the chain must still lead through it.
+
+    Attributes
+    ----------
+    sequence
+        Number of a line; 0 is before the first.
+    mac
+        The 32 bytes of its MAC.
+    """
+
+    sequence: int
+    mac: bytes = field(repr=False)
+
+    def __str__(self) -> str:
+        return f"{self.sequence}:{self.mac.hex()}"
+
+    @classmethod
+    def parse(cls, text: str) -> "Anchor":
+        """Read what ``str`` wrote, or raise :class:`InvalidIdentifier`."""
+        match = _ANCHOR.fullmatch(text)
+        if match is None:
+            raise InvalidIdentifier(
+                "an anchor is a line's number, a colon and 64 hexadecimal digits"
+            )
+        return cls(int(match[1]), bytes.fromhex(match[2]))
 
 
-def _checked_text(text: str | None, longest: int, what: str) -> None:
-    if text is not None and not (0 < len(text) <= longest and text.isprintable()):
-        raise InvalidIdentifier(
-            f"the {what} of an audit line is 1 to {longest} printable characters"
-        )
+START = Anchor(0, bytes(32))
+
+
+@dataclass(frozen=True)
+class Head:
+    """Both ends of the chain: it begins after `base` and ends with `last`."""
+
+    base: Anchor
+    last: Anchor
+
+    def mac(self, key: bytes) -> bytes:
+        """MAC of the head row."""
+        ends = (self.base.sequence, self.base.mac, self.last.sequence, self.last.mac)
+        return hmac.digest(key, encode_parts("head", *ends), hashlib.sha256)
 
 
 @dataclass(frozen=True)
@@ -96,12 +118,12 @@ class By:
     request_id: str | None = None
 
     def __post_init__(self) -> None:
-        _checked_text(self.actor, MAX_ACTOR, "actor")
-        _checked_text(self.request_id, MAX_REQUEST_ID, "request id")
+        _check_text(self.actor, "actor")
+        _check_text(self.request_id, "request id")
 
 
 PROGRAM = By()
-"""Whoever does something without saying who."""
+"""The actor of what the program does by itself."""
 
 
 @dataclass(frozen=True)
@@ -121,8 +143,8 @@ class Entry:
         anything but 64 hexadecimal digits is refused.
     detail
         What else it was done with: the level of a verification, the prefix of a key.
-    nonce
-        Keyed digest, 64 hexadecimal digits, of the nonce that it used up.
+    token
+        Of the one-use token that it used up (:func:`token_digest`).
     """
 
     action: str
@@ -131,18 +153,117 @@ class Entry:
     tenant: str | None = None
     pseudonym: str | None = None
     detail: str | None = None
-    nonce: str | None = None
+    token: str | None = None
 
     def __post_init__(self) -> None:
         checked_opaque_id(self.action, what="audit action")
         checked_opaque_id(self.outcome, what="audit outcome")
         if self.tenant is not None:
             checked_tenant_name(self.tenant)
-        if self.pseudonym is not None and not is_digest(self.pseudonym):
-            raise InvalidIdentifier("the audit log names a subject by its pseudonym only")
-        _checked_text(self.detail, MAX_DETAIL, "detail")
-        if self.nonce is not None and not is_digest(self.nonce):
-            raise InvalidIdentifier("the audit log keeps the digest of a nonce only")
+        for digest in (self.pseudonym, self.token):
+            if digest is not None and not _DIGEST.fullmatch(digest):
+                raise InvalidIdentifier(
+                    "the audit log names a subject by its pseudonym and a token by its digest only"
+                )
+        _check_text(self.detail, "detail")
+
+
+@dataclass(frozen=True)
+class Line:
+    """One line of the audit log, as it is stored."""
+
+    sequence: int
+    at: datetime
+    tenant: str | None
+    actor: str
+    action: str
+    pseudonym: str | None
+    outcome: str
+    request_id: str | None
+    detail: str | None
+    token: str | None = field(repr=False)
+    mac: bytes = field(repr=False)
+
+
+@dataclass(frozen=True)
+class Problem:
+    """The first break of the chain.
+
+    Attributes
+    ----------
+    sequence
+        Number of the line at which it breaks.
+    what
+        ``"altered"``, ``"missing"``, ``"out of order"``, ``"head does not match"`` or
+        ``"anchor not in chain"``.
+    """
+
+    sequence: int
+    what: str
+
+
+@dataclass(frozen=True)
+class Verification:
+    """What a walk over the whole chain showed.
+
+    Attributes
+    ----------
+    lines
+        Lines that were good.
+    head
+        The last of them.
+    problem
+        The first break; None where the chain is whole.
+    """
+
+    lines: int
+    head: Anchor
+    problem: Problem | None
+
+    @property
+    def intact(self) -> bool:
+        """Whether nothing is wrong."""
+        return self.problem is None
+
+
+def token_digest(key_prefix: str, value: str) -> str:
+    """What the log keeps of a one-use token or challenge: 64 hexadecimal digits.
+
+    Parameters
+    ----------
+    key_prefix
+        Of the API key that asked for it.
+    value
+        Its random id.
+    """
+    return hashlib.sha256(encode_parts("token", key_prefix, value)).hexdigest()
+
+
+def line_mac(key: bytes, values: Mapping[str, Any], previous: bytes) -> bytes:
+    """MAC of a line.
+
+    Parameters
+    ----------
+    key
+        Secret of the chain, 32 bytes.
+    values
+        The columns of ``audit_log`` by name; ``mac`` is not looked at.
+    previous
+        MAC of the line before.
+
+    Raises
+    ------
+    TypeError
+        If a column holds what this program never writes.
+    """
+    parts: list[str | int] = []
+    for name in _COLUMNS[:-1]:
+        value = values[name]
+        # No column that may be NULL holds a number, so 0 cannot be taken for one.
+        if value is not None and type(value) not in (str, int):
+            raise TypeError(f"{name} holds a {type(value).__name__}")
+        parts.append(0 if value is None else value)
+    return hmac.digest(key, encode_parts("line", previous, *parts), hashlib.sha256)
 
 
 class AuditLog:
@@ -158,115 +279,32 @@ class AuditLog:
         self._database = database
         self._secrets = secrets
         self._clock = clock
-        self._row_keys: dict[bytes, bytes] = {}
 
-    def begin(self) -> None:
-        """Make the key of a chain that never began, and the MAC of its head; else do nothing.
+    @property
+    def key(self) -> bytes:
+        """The secret of the chain."""
+        return self._secrets.get(SecretName.CHAIN)
 
-        The migration made the head row, and has no key. Nothing but this makes the key: once it is
-        gone, it is not made anew while a line or the MAC of a head tells that there was one. Where
-        all three are gone, the log is taken for one that never began: then an anchor from before
-        is what shows that lines are missing.
+    def begin(self, connection: Connection, key: bytes, base: Anchor = START) -> None:
+        """Begin a chain under a new key, in a write; a head that is there already is replaced."""
+        head = Head(base, base)
+        connection.execute(sa.delete(AuditHeadRow))
+        connection.execute(sa.insert(AuditHeadRow).values(id=1, **head_columns(head, key)))
 
-        Raises
-        ------
-        BrokenAuditLog
-            If the key is gone.
-        """
-        self._database.write(self._begin, lock=_BEGIN_LOCK)
-
-    def _begin(self, connection: Connection) -> None:
-        secret = self._secrets.make(connection, SecretName.CHAIN)
-        if secret is None:
-            return
-        head, mac = read_head(connection)
-        written = connection.execute(sa.select(sa.exists(AuditRow.sequence))).scalar_one()
-        if written or head != START or mac:
-            raise _without_key()  # which takes back the key that was made
-        connection.execute(sa.update(AuditHeadRow).values(mac=head_mac(secret.value, START)))
-
-    def prepare(self) -> None:
-        """Open the key of the chain; to be called before a transaction that appends.
-
-        Raises
-        ------
-        BrokenAuditLog
-            If there is none.
-        SealError
-            If the master key that wrapped it is missing.
-        """
-        self.row_key()
-
-    def line_keys(self) -> LineKeys:
-        """Keys of the chain.
-
-        Raises
-        ------
-        BrokenAuditLog
-            If they are gone.
-        """
-        chain = self._chain()
-        return LineKeys(chain.value, tuple((key.line, key.value) for key in chain.retired))
-
-    def row_key(self) -> bytes:
-        """Key of the MACs of rows, derived from the chain's: they are lost together.
-
-        Raises
-        ------
-        BrokenAuditLog
-            If the key of the chain is gone.
-        """
-        return self.row_key_of(self._key())
-
-    def row_key_of(self, chain_key: bytes) -> bytes:
-        """:meth:`row_key` of another key of the chain than the one in force."""
-        if chain_key not in self._row_keys:
-            self._row_keys[chain_key] = derive_key(chain_key, "rows")
-        return self._row_keys[chain_key]
-
-    def append(self, connection: Connection, entry: Entry) -> int:
-        """Add a line inside a transaction that is open already; returns its number.
-
-        The lines of all processes are added one after the other, each waiting for the commit of
-        the one before: whatever follows this call in the transaction makes every other write wait.
-        Nothing follows but rows that carry the number of their line, which the transaction has
-        locked before. As everybody takes the head row last, no two of them wait for each other.
+    def append(self, connection: Connection, entry: Entry, *, key: bytes | None = None) -> None:
+        """Add a line inside a write, under the secret of the chain or the one that it begins with.
 
         Raises
         ------
         BrokenAuditLog
             If the head row is missing or forged. Adding to it would hide that.
-        RuntimeError
-            If :meth:`prepare` was not called before the transaction: opening the key is a
-            transaction of its own, which on SQLite would wait for this one.
         """
-        chain = self._secrets.opened(SecretName.CHAIN)
-        if chain is None:
-            raise RuntimeError("call AuditLog.prepare before the transaction")
-        return self._append(connection, entry, chain.value).sequence
-
-    def hand_over(self, connection: Connection, by: By) -> tuple[Secret, Anchor]:
-        """Renew the key of the chain in a transaction of :meth:`Secrets.write_alone`.
-
-        A line under the old key ends its time, and one under the new key begins the next, with the
-        hash of the other in it. Returns the secret, and the new head.
-        """
-        old = self._key()
-        end = self._append(connection, Entry(RENEWAL, "retired", by), old)
-        fresh = self._secrets.renew(
-            connection, SecretName.CHAIN, at=self._clock(), line=end.sequence
-        )
-        assert fresh is not None, "its value was read just now"  # noqa: S101
-        moved = head_mac(fresh.value, end)
-        connection.execute(_MOVE_HEAD, {"sequence": end.sequence, "hash": end.hash, "mac": moved})
-        begun = self._append(connection, Entry(RENEWAL, "renewed", by), fresh.value)
-        return fresh, begun
-
-    def _append(self, connection: Connection, entry: Entry, key: bytes) -> Anchor:
-        last = self._head(connection, key, for_update=True)
-        values: dict[str, str | int | bytes | datetime | None] = {
-            "sequence": last.sequence + 1,
-            "at": self._clock(),
+        key = key or self.key
+        head = read_head(connection, key)
+        at = self._clock().astimezone(UTC).isoformat(timespec="microseconds")
+        values: dict[str, Any] = {
+            "sequence": head.last.sequence + 1,
+            "at": at,
             "tenant": entry.tenant,
             "actor": entry.by.actor,
             "action": entry.action,
@@ -274,181 +312,238 @@ class AuditLog:
             "outcome": entry.outcome,
             "request_id": entry.by.request_id,
             "detail": entry.detail,
-            "nonce": entry.nonce,
-            "previous_hash": last.hash,
+            "token": entry.token,
         }
-        new = Anchor(last.sequence + 1, line_hash(key, values))
-        connection.execute(_ADD_LINE, {**values, "hash": new.hash})
-        moved = {"sequence": new.sequence, "hash": new.hash, "mac": head_mac(key, new)}
-        connection.execute(_MOVE_HEAD, moved)
-        return new
+        values["mac"] = line_mac(key, values, head.last.mac)
+        connection.execute(_ADD_LINE, values)
+        moved = Head(head.base, Anchor(values["sequence"], values["mac"]))
+        connection.execute(MOVE_HEAD, head_columns(moved, key))
 
     def record(self, entry: Entry) -> None:
         """Add a line in a transaction of its own."""
-        self.prepare()
-        self._secrets.write(lambda connection: self.append(connection, entry))
+        self._database.write(lambda connection: self.append(connection, entry))
 
     def head(self) -> Anchor:
-        """Number and hash of the last line; keep them elsewhere, to verify the log against.
+        """Number and MAC of the last line; keep them elsewhere, to verify the log against.
 
         Raises
         ------
         BrokenAuditLog
             If the head row is missing or forged.
         """
-        self.prepare()
-        return self._secrets.read(lambda connection: self._head(connection, self._key()))
+        return self._database.read(lambda connection: read_head(connection, self.key)).last
 
-    def lines(self, *, after: int = 0, batch: int = BATCH) -> Iterator[Line]:
-        """Read the log from the line after `after` on, a batch in memory at a time.
+    def use_of(self, token: str) -> Line | None:
+        """Return the line that tells what a one-use token was used for, if it was used."""
+        query = LINES.where(AuditRow.token == token)
+        row = self._database.read(lambda connection: connection.execute(query).one_or_none())
+        return None if row is None else _line(row)
+
+    def require_unused(self, token: str) -> None:
+        """Refuse early what a write would refuse; it decides nothing itself.
 
         Raises
         ------
-        StoreError
-            At a line that was altered so that it cannot be read.
+        Replayed
         """
-        while rows := self._database.read(partial(read_lines, after=after, batch=batch)):
-            yield from (read_line(row._mapping) for row in rows)
+        if self._database.read(lambda connection: is_used(connection, token)):
+            raise Replayed
+
+    def lines(self, *, after: int = 0, batch: int = BATCH) -> Iterator[Line]:
+        """Lines in their order, beginning after one; read in batches, and not verified."""
+        while rows := self._read(after, batch):
+            yield from map(_line, rows)
             after = rows[-1].sequence
 
     def page(
-        self,
-        tenant: str,
-        *,
-        limit: int,
-        before: int | None = None,
-        pseudonyms: Sequence[str] = (),
-    ) -> tuple[list[tuple[int, Line | None]], int | None]:
-        """Read the latest lines of a tenant, the latest first.
-
-        It begins at the line that the head names, and ends after the last erasure of a tenant of
-        this name: the lines before are not this tenant's.
+        self, tenant: str, *, limit: int, before: int | None = None, pseudonym: str | None = None
+    ) -> tuple[list[Line], int | None]:
+        """A tenant's lines, the latest first; not those of an erased tenant of the same name.
 
         Parameters
         ----------
         tenant
-            Whose lines.
+            Its name.
         limit
-            So many lines at most.
+            Lines of the page.
         before
-            What the page before returned; None begins at the end of the log.
-        pseudonyms
-            Only lines on a subject that has one of these.
+            Only lines with smaller numbers.
+        pseudonym
+            Only lines on this subject.
 
         Returns
         -------
-        The lines by their numbers, None for one that was altered; and the number to go on before,
-        None at the beginning of the log. That lines were removed or moved, only :meth:`verify`
-        finds. No more than :data:`SCANNED` lines of all tenants are looked through, so a page may
-        be short, or empty, and not the last.
-
-        Raises
-        ------
-        BrokenAuditLog
-            If the head row, or the key of the chain, is missing or forged.
+        The lines, and the number to go on before; None at the end.
         """
-
-        def work(connection: Connection) -> tuple[list[tuple[int, Line | None]], int | None]:
-            keys = self.line_keys()
-            head = self._head(connection, keys.current).sequence
-            end = head + 1 if before is None else min(before, head + 1)
-            start = self._last_erasure(connection, tenant, keys, head)
-            above = max(start, end - 1 - SCANNED)
-            rows = read_tenant_lines(
-                connection, tenant, pseudonyms, above=above, before=end, limit=limit + 1
-            )
-            lines = [(row.sequence, true_line(keys, row._mapping)) for row in rows[:limit]]
-            if len(rows) > limit:
-                return lines, lines[-1][0]
-            return lines, above + 1 if above > start else None
-
-        self.prepare()
-        return self._secrets.read(work)
-
-    def _last_erasure(self, connection: Connection, tenant: str, keys: LineKeys, head: int) -> int:
-        for row in read_tenant_erasures(connection, tenant, through=head):
-            # A made-up one would hide the lines before it.
-            if true_line(keys, row._mapping) is not None:
-                return int(row.sequence)
-        return 0
+        erased = sa.select(sa.func.coalesce(sa.func.max(AuditRow.sequence), 0)).where(
+            AuditRow.tenant == tenant,
+            AuditRow.action == TENANT_ERASE,
+            AuditRow.outcome == "erased",
+        )
+        query = LINES.where(AuditRow.tenant == tenant, AuditRow.sequence > erased.scalar_subquery())
+        if before is not None:
+            query = query.where(AuditRow.sequence < before)
+        if pseudonym is not None:
+            query = query.where(AuditRow.pseudonym == pseudonym)
+        query = query.order_by(AuditRow.sequence.desc()).limit(limit + 1)
+        rows = self._database.read(lambda connection: connection.execute(query).all())
+        lines = [_line(row) for row in rows[:limit]]
+        return lines, lines[-1].sequence if len(rows) > limit else None
 
     def verify(
         self,
         *,
         anchor: Anchor | None = None,
+        seen: Callable[[Mapping[str, Any]], None] | None = None,
         progress: Callable[[int], None] | None = None,
         batch: int = BATCH,
     ) -> Verification:
-        """Walk over the whole chain beside a service in use, a batch in memory at a time.
+        """Walk over the whole chain beside a service in use, up to the first break.
 
         Parameters
         ----------
         anchor
             An earlier head. Without one, an old state of the whole log is not told from a new one.
+        seen
+            Called with the columns of each good line.
         progress
             Called after each batch with the number of its lines.
         batch
-            Lines read at once.
+            Lines read at once, and in memory.
 
         Raises
         ------
-        BrokenAuditLog
-            If the key of the chain is gone, so that nothing can be checked.
         SealError
             If the master key is not the one that the log was written with.
         """
-        keys = self.line_keys()
+        key = self.key
+        try:
+            base = self._database.read(lambda connection: read_head(connection, key)).base
+        except BrokenAuditLog:
+            return Verification(0, START, Problem(0, "head does not match"))
+        last, count, is_anchored = base, 0, anchor in (None, base)
         while True:
-            verification = self._walk(keys, anchor, progress, batch)
-            # Renewed during the walk, the lines after it are under a key that was not known.
-            self._secrets.read(self._secrets.follow)
-            if keys == (keys := self.line_keys()):
-                return verification
-
-    def _walk(
-        self,
-        keys: LineKeys,
-        anchor: Anchor | None,
-        progress: Callable[[int], None] | None,
-        batch: int,
-    ) -> Verification:
-        chain = Chain(keys, anchor=anchor)
-        after: int | None = None
-        while True:
-            while rows := self._database.read(partial(read_lines, after=after, batch=batch)):
-                for row in rows:
-                    chain.step(row._mapping)
-                after = rows[-1].sequence
-                if progress is not None:
-                    progress(len(rows))
-            end = self._database.read(partial(read_end, after=after))
-            if not end.more:
-                return chain.end(end.head, end.mac, held=end.held)
-
-    def _chain(self) -> Secret:
-        chain = self._secrets.existing(SecretName.CHAIN)
-        if chain is None:
-            raise _without_key()
-        return chain
-
-    def _key(self) -> bytes:
-        return self._chain().value
-
-    def _head(self, connection: Connection, key: bytes, *, for_update: bool = False) -> Anchor:
-        head, mac = read_head(connection, for_update=for_update)
-        if head is None or not is_head(key, head, mac):
-            raise BrokenAuditLog(
-                "the head of the audit log is missing or was altered: "
-                "run `veilface audit-log verify`, and restore the database from a backup"
+            # In one query: a line that comes later is not taken for one beyond the head.
+            head, rows = self._database.read(
+                lambda connection, after=last.sequence: (  # type: ignore[misc]
+                    read_head(connection, key),
+                    _first_lines(connection, base, after, batch),
+                )
             )
-        return head
+            for row in rows:
+                values = row._mapping
+                if what := line_break(key, values, last):
+                    number = min(values["sequence"], last.sequence + 1)
+                    return Verification(count, last, Problem(number, what))
+                last, count = Anchor(values["sequence"], values["mac"]), count + 1
+                is_anchored |= last == anchor
+                if seen is not None:
+                    seen(values)
+            if progress is not None and rows:
+                progress(len(rows))
+            if not rows:
+                break
+        if head.last != last:
+            missing = head.last.sequence > last.sequence
+            what = "missing" if missing else "head does not match"
+            return Verification(count, last, Problem(last.sequence + missing, what))
+        if not is_anchored and anchor is not None:
+            return Verification(count, last, Problem(anchor.sequence, "anchor not in chain"))
+        return Verification(count, last, None)
+
+    def lines_after(self, connection: Connection, last: Anchor) -> Iterator[Mapping[str, Any]]:
+        """Columns of the lines after the last one of a walk, in a write, up to the first break."""
+        query = LINES.where(AuditRow.sequence > last.sequence).order_by(AuditRow.sequence)
+        rows: Any = connection.execute(query).all()
+        for row in rows:
+            if line_break(self.key, row._mapping, last):
+                return
+            last = Anchor(row.sequence, row.mac)
+            yield row._mapping
+
+    def _read(self, after: int, batch: int) -> Sequence[Any]:
+        query = LINES.where(AuditRow.sequence > after).order_by(AuditRow.sequence).limit(batch)
+        return self._database.read(lambda connection: connection.execute(query).all())
 
     def __repr__(self) -> str:
         return "AuditLog()"
 
 
-def _without_key() -> BrokenAuditLog:
-    return BrokenAuditLog(
-        "the key of the audit log is missing: run `veilface db upgrade` on a new database, and "
-        "restore any other from a backup"
+# Made once: building a statement costs more than running it, and every write appends a line.
+_ADD_LINE = sa.insert(AuditRow.__table__)  # type: ignore[arg-type]
+MOVE_HEAD = sa.update(AuditHeadRow.__table__)  # type: ignore[arg-type]
+# The MAC as it is: SQLite keeps any value in any column, and an altered one must still arrive.
+LINES: Any = sa.select(
+    *(getattr(AuditRow, name) for name in _COLUMNS[:-1]),
+    sa.type_coerce(AuditRow.mac, sa.types.NullType()).label("mac"),
+)
+_HEADS: Any = sa.select(
+    *(
+        sa.type_coerce(getattr(AuditHeadRow, name), sa.types.NullType()).label(name)
+        for name in (*_HEAD, "mac")
     )
+)
+
+
+def is_used(connection: Connection, token: str) -> bool:
+    """Whether a one-use token has a line that used it up."""
+    query = sa.select(AuditRow.sequence).where(AuditRow.token == token)
+    return connection.execute(query).first() is not None
+
+
+def read_head(connection: Connection, key: bytes) -> Head:
+    """Read both ends of the chain.
+
+    Raises
+    ------
+    BrokenAuditLog
+        If the row is missing or forged.
+    """
+    rows = connection.execute(_HEADS).all()
+    if len(rows) == 1:
+        row = rows[0]
+        with_types = [type(value) for value in row]
+        if with_types == [int, bytes, int, bytes, bytes]:
+            head = Head(Anchor(row.base_sequence, row.base_mac), Anchor(row.sequence, row.line_mac))
+            if hmac.compare_digest(head.mac(key), row.mac):
+                return head
+    raise BrokenAuditLog(
+        "the head of the audit log is missing or was altered: "
+        "run `veilface audit-log verify`, and restore the database from a backup"
+    )
+
+
+def head_columns(head: Head, key: bytes) -> dict[str, Any]:
+    """Columns of the head row."""
+    ends = (head.base.sequence, head.base.mac, head.last.sequence, head.last.mac)
+    return {**dict(zip(_HEAD, ends, strict=True)), "mac": head.mac(key)}
+
+
+def _first_lines(connection: Connection, base: Anchor, after: int, batch: int) -> Sequence[Any]:
+    # From the very first row: a line that was slipped in before the base must be seen too.
+    after = after if after > base.sequence else -(2**62)
+    query = LINES.where(AuditRow.sequence > after).order_by(AuditRow.sequence).limit(batch)
+    return connection.execute(query).all()
+
+
+def line_break(key: bytes, values: Mapping[str, Any], last: Anchor) -> str | None:
+    """Say why a line does not follow; None where it does."""
+    if values["sequence"] != last.sequence + 1:
+        return "missing" if values["sequence"] > last.sequence else "out of order"
+    try:
+        expected = line_mac(key, values, last.mac)
+    except TypeError:
+        return "altered"
+    mac = values["mac"]
+    is_true = isinstance(mac, bytes) and hmac.compare_digest(expected, mac)
+    return None if is_true else "altered"
+
+
+def _line(row: Any) -> Line:
+    try:
+        return Line(**{**row._mapping, "at": datetime.fromisoformat(row.at)})
+    except (ValueError, TypeError):
+        raise StoreError(
+            f"line {row.sequence} of the audit log was altered and cannot be read: "
+            "run `veilface audit-log verify`"
+        ) from None

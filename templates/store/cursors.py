@@ -28,7 +28,7 @@ def open_cursor(keyring: MasterKeyring, cursor: str, *, purpose: str, tenant: st
         raise InvalidIdentifier("this cursor is too long to be one of ours")
     try:
         sealed = base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4))
-        return keyring.open(sealed, purpose=purpose, bound_to=[tenant], refresh=False).decode()
+        return keyring.open(sealed, purpose=purpose, bound_to=[tenant]).decode()
     except (SealError, binascii.Error, ValueError):
         raise InvalidIdentifier(
             "this cursor was not given for this list: start again without one"

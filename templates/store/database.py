@@ -1,15 +1,13 @@
-"""The connection to SQLite or PostgreSQL: transactions, retries, and errors in our own words.
+"""The connection to SQLite or PostgreSQL: transactions, waits, and errors in our own words.
 
 One :class:`Database` may be used by many threads, and survives a fork: each process makes its own
-connections. A write runs as one function inside one transaction; it may be run again when the
-database asks for that (a deadlock, a serialisation failure), so it must do nothing but database
-work.
+connections. Writes are one at a time over all processes and hosts, on both databases. So what a
+write has read stays true until it commits, and no two writes wait for each other.
 """
 
 import contextlib
 import hashlib
 import os
-import random
 import sqlite3
 import threading
 import time
@@ -28,8 +26,6 @@ from templates.store.turn import next_in_line
 
 T = TypeVar("T")
 
-_ATTEMPTS = 5
-_RETRIED_STATES = {"40001", "40P01"}  # serialisation failure, deadlock
 try:
     import psycopg
 
@@ -43,11 +39,19 @@ _DATABASE_ERRORS: tuple[type[Exception], ...] = (
     OSError,
     *_POSTGRES,
 )
-_WRITING = "veilface writing"  # lock that every write shares, see await_writers
 _EMPTY_LOG = "PRAGMA wal_checkpoint(TRUNCATE)"
 PURGE_WAIT_S = 0.25
 """Longest that emptying SQLite's log waits for readers, and so makes writers wait."""
 _UNAVAILABLE_CLASSES = {"08", "53", "57", "58"}  # connection, resources, operator, system
+_LOCK_NOT_AVAILABLE, _DEADLOCK, _SERIALISATION = "55P03", "40P01", "40001"
+
+# The server takes the columns in their order, so the limit, in milliseconds, holds for the lock.
+_BEGIN_WRITE = sa.select(
+    sa.func.set_config("lock_timeout", sa.bindparam("limit", type_=sa.String), True),
+    sa.func.pg_advisory_xact_lock(
+        int.from_bytes(hashlib.sha256(b"veilface write").digest()[:8], "big", signed=True)
+    ),
+)
 
 
 class Database:
@@ -61,7 +65,7 @@ class Database:
     pool_size, max_overflow
         Connections kept, and further ones under load, in each process.
     timeout
-        Seconds to wait for a connection, or for other writers, of whatever process (SQLite).
+        Seconds to wait for a connection, or for another write of any process.
 
     Raises
     ------
@@ -88,80 +92,38 @@ class Database:
     def read(self, work: Callable[[Connection], T]) -> T:
         """Run `work` on a connection; what it sees is committed.
 
-        It must do nothing but database work: after a deadlock it runs again.
+        Raises
+        ------
+        StoreUnavailable, StoreError
+            In our own words, without a statement, its parameters or a row.
         """
         process = self._process()
+        with _translating(), process.readers.connect() as connection:
+            if self.is_sqlite:
+                _driver(connection).execute("BEGIN")
+                process.require_file()
+            return work(connection)
 
-        def once() -> T:
-            with process.readers.connect() as connection:
-                if self.is_sqlite:
-                    _driver(connection).execute("BEGIN")
-                    process.require_file()
-                return work(connection)
-
-        return _again(once)
-
-    def write(
-        self, work: Callable[[Connection], T], *, lock: str | None = None, wait: float | None = None
-    ) -> T:
-        """Run `work` in one transaction and commit it; all or nothing.
+    def write(self, work: Callable[[Connection], T], *, wait: float | None = None) -> T:
+        """Run `work` in one transaction, while no other write runs, and commit it.
 
         Parameters
         ----------
         work
-            May run several times; only its last run counts.
-        lock
-            Writes with the same lock name run one after the other, over all processes. (On SQLite
-            all writes do.)
+            For a short time: every other write waits for it.
         wait
-            Seconds to wait for a lock that another write holds; the timeout by default, 0 for
-            as long as it takes. (PostgreSQL only.)
-        """
-        limit = {"limit": self._lock_limit(wait)}
-        if lock is None:
-            return self._transaction(work, _BESIDE, limit)
-        return self._transaction(work, _BESIDE_UNDER, {**limit, "lock": _lock_number(lock)})
-
-    def write_alone(self, work: Callable[[Connection], T]) -> T:
-        """:meth:`write`, while no other write of any process runs.
-
-        It begins when the writes that are under way have ended, and those that come wait for it:
-        for short work only.
+            Seconds to wait for other writes; the timeout by default, and 0 on PostgreSQL for as
+            long as it takes.
 
         Raises
         ------
-        StoreUnavailable
-            If a write that is under way takes longer than the timeout.
+        StoreBusy
+            If other writes take longer.
+        StoreUnavailable, StoreError
+            As of :meth:`read`. Nothing was written.
         """
-        # On SQLite the transaction itself waits for the other writers.
-        return self._transaction(work, _ALONE, {"limit": self._lock_limit(None)})
-
-    def try_locks(self, connection: Connection, names: Sequence[str]) -> list[bool]:
-        """Take locks of :meth:`write` until the end of a transaction, where they are free.
-
-        Parameters
-        ----------
-        connection
-            Of a write.
-        names
-            At most a thousand.
-
-        Returns
-        -------
-        list of bool
-            Whether each was free. On SQLite all are: no other write runs.
-        """
-        if self.is_sqlite or not names:
-            return [True] * len(names)
-        attempts = (sa.func.pg_try_advisory_xact_lock(_lock_number(name)) for name in names)
-        return list(connection.execute(sa.select(*attempts)).one())
-
-    def _transaction(
-        self, work: Callable[[Connection], T], locks: sa.Executable, names: dict[str, Any]
-    ) -> T:
         process = self._process()
-
-        def once() -> T:
+        with _translating():
             if self.is_sqlite:
                 # Threads queue here in turn; SQLite's own lock is polled and knows no order.
                 until = time.monotonic() + self._timeout
@@ -170,11 +132,10 @@ class Database:
                         driver.execute("BEGIN IMMEDIATE")
                     process.require_file()
                     return work(connection)
+            limit = str(round(1000 * (self._timeout if wait is None else wait)))
             with process.engine.begin() as connection:
-                connection.execute(locks, names)
+                connection.execute(_BEGIN_WRITE, {"limit": limit})
                 return work(connection)
-
-        return _again(once)
 
     def purge_log(self) -> bool:
         """Move SQLite's write-ahead log into the database file and empty it.
@@ -197,39 +158,21 @@ class Database:
             return not busy
         return False
 
-    def remove(self, table: type[Any], condition: sa.ColumnElement[bool], *, batch: int) -> int:
-        """Remove the rows of a mapped table that meet a condition; returns how many.
-
-        In small transactions of `batch` rows, so that after a long pause no write waits for all
-        of it.
-        """
-        primary_key = sa.inspect(table).primary_key
-        some = sa.select(*primary_key).where(condition).limit(batch)
-        # The condition twice: a row that changed since it was selected is looked at again.
-        statement = sa.delete(table).where(condition, sa.tuple_(*primary_key).in_(some))
-        removed = 0
-        # Read first: a round that finds nothing, and most do, takes no lock.
-        while self.read(lambda connection: connection.execute(some).first()) is not None:
-            removed += self.write(lambda connection: connection.execute(statement).rowcount)
-        return removed
-
     def compact(self, tables: Sequence[str]) -> None:
         """Rewrite tables (PostgreSQL) or the file (SQLite) without what was removed from them."""
         process = self._process()
-        try:
-            autocommit = process.engine.execution_options(isolation_level="AUTOCOMMIT")
-            with (
-                process.turn_to_write(),
-                self._turn(time.monotonic() + self._timeout),
-                autocommit.connect() as connection,
-            ):
-                if self.is_sqlite:
-                    _driver(connection).execute("VACUUM")
-                for table in () if self.is_sqlite else tables:
-                    name = connection.dialect.identifier_preparer.quote(table)
-                    connection.exec_driver_sql(f"VACUUM (FULL) {name}")
-        except _DATABASE_ERRORS as error:
-            raise _translated(error) from None
+        autocommit = process.engine.execution_options(isolation_level="AUTOCOMMIT")
+        with (
+            _translating(),
+            process.turn_to_write(),
+            self._turn(time.monotonic() + self._timeout),
+            autocommit.connect() as connection,
+        ):
+            if self.is_sqlite:
+                _driver(connection).execute("VACUUM")
+            for table in () if self.is_sqlite else tables:
+                name = connection.dialect.identifier_preparer.quote(table)
+                connection.exec_driver_sql(f"VACUUM (FULL) {name}")
         self.purge_log()
 
     def size(self) -> int:
@@ -245,18 +188,6 @@ class Database:
         """Close the connections of this process that are idle."""
         self._process().engine.dispose()
 
-    def await_writers(self) -> None:
-        """Return when every write that had begun before has ended.
-
-        A write that begins later sees whatever was changed before this call, files included.
-
-        Raises
-        ------
-        StoreUnavailable
-            If one takes longer than the timeout.
-        """
-        self.write_alone(lambda _: None)
-
     def _turn(self, until: float) -> contextlib.AbstractContextManager[None]:
         """The turn to wait for SQLite's lock; nothing on PostgreSQL."""
         return contextlib.nullcontext() if self._file is None else next_in_line(self._file, until)
@@ -270,9 +201,6 @@ class Database:
             yield driver
         finally:
             driver.execute(_busy_timeout(self._timeout))
-
-    def _lock_limit(self, wait: float | None) -> str:
-        return str(round(1000 * (self._timeout if wait is None else wait)))
 
     def _process(self) -> "_Process":
         if self._own.pid != os.getpid():
@@ -360,44 +288,12 @@ def _driver(connection: Connection) -> Any:
     return connection.connection.driver_connection
 
 
-def _lock_number(name: str) -> int:
-    return int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big", signed=True)
-
-
-# Made once: building a statement costs more than running it. PostgreSQL takes the columns of one in
-# their order, so the limit, in milliseconds, holds for the locks.
-_LIMIT = sa.func.set_config("lock_timeout", sa.bindparam("limit", type_=sa.String), True)
-# What runs alone may compute for long between two statements, over all receipts for example.
-_ALONE = sa.select(
-    _LIMIT,
-    sa.func.set_config("idle_in_transaction_session_timeout", "0", True),
-    sa.func.pg_advisory_xact_lock(_lock_number(_WRITING)),
-)
-_BESIDE = sa.select(_LIMIT, sa.func.pg_advisory_xact_lock_shared(_lock_number(_WRITING)))
-_BESIDE_UNDER = _BESIDE.add_columns(
-    sa.func.pg_advisory_xact_lock(sa.bindparam("lock", type_=sa.BigInteger))
-)
-
-
-def _state(error: BaseException | None) -> str:
-    return getattr(error, "sqlstate", None) or ""
-
-
-def _again(once: Callable[[], T]) -> T:
-    """Run a transaction again where the server ended it for another one's sake.
-
-    Reads too: a migration and a query may each hold a table that the other waits for.
-    """
-    for attempt in range(1, _ATTEMPTS + 1):
-        try:
-            return once()
-        except DBAPIError as error:
-            if attempt == _ATTEMPTS or _state(error.orig) not in _RETRIED_STATES:
-                raise _translated(error) from None
-            time.sleep(random.uniform(0, 0.02 * 2**attempt))
-        except _DATABASE_ERRORS as error:
-            raise _translated(error) from None
-    raise AssertionError("the last attempt returns or raises")
+@contextlib.contextmanager
+def _translating() -> Iterator[None]:
+    try:
+        yield
+    except _DATABASE_ERRORS as error:
+        raise _translated(error) from None
 
 
 def _translated(error: Exception) -> StoreError:
@@ -410,11 +306,11 @@ def _translated(error: Exception) -> StoreError:
     if isinstance(cause, sqlite3.Error):
         return _sqlite_error(cause)
     if isinstance(cause, _POSTGRES):
-        state = _state(cause)
+        state = getattr(cause, "sqlstate", None) or ""
         if state == "42P01":
             return StoreError("a table is missing: run `veilface db upgrade`")
-        if state == "55P03":
-            return StoreBusy("another write holds the same rows for too long")
+        if state in (_LOCK_NOT_AVAILABLE, _DEADLOCK, _SERIALISATION):
+            return StoreBusy("another write, or a command on whole tables, takes too long")
         # The server answers with a state; without one the connection failed.
         unanswered = not state and isinstance(cause, _UNANSWERED)
         if lost or state[:2] in _UNAVAILABLE_CLASSES or unanswered:

@@ -12,10 +12,6 @@ from sqlalchemy.engine import URL, Engine, make_url
 from sqlalchemy.exc import ArgumentError
 
 from templates.errors import StoreError
-from templates.store.migrations import NEWEST
-
-APPLICATION = "veilface"
-"""What sessions of PostgreSQL are named by, before the number of the schema that they need."""
 
 _CUT_OFF = {
     "keepalives_idle": 5,
@@ -87,7 +83,7 @@ def make_engine(url: URL, *, timeout: float, pool_size: int, max_overflow: int) 
             pool_pre_ping=True,
             connect_args={
                 "connect_timeout": max(2, round(timeout)),
-                "application_name": f"{APPLICATION} {NEWEST}",
+                "application_name": "veilface",
                 # Text would arrive as bytes from a server that was made without a locale.
                 "client_encoding": "utf8",
                 "options": _session_options(url),

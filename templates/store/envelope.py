@@ -49,7 +49,7 @@ class Owner:
 
 @dataclass(frozen=True)
 class Envelope:
-    """A template as it is kept."""
+    """A template as it is stored: its wrapped data key, and its ciphertext."""
 
     wrapped_key: bytes = field(repr=False)
     ciphertext: bytes = field(repr=False)
@@ -75,8 +75,8 @@ def open_envelope(envelope: Envelope, owner: Owner, keyring: MasterKeyring) -> b
     Raises
     ------
     SealError
-        If the ciphertext or the wrapped key was altered, or belongs to another owner or another
-        enrollment, or its master key is missing.
+        If key or ciphertext was altered, or belongs to another owner or another enrollment, or if
+        the master key is missing.
     """
     data_key = keyring.open(
         envelope.wrapped_key,

@@ -1,34 +1,43 @@
-"""Erasing a subject: everything about it goes, a signed receipt comes."""
+"""Erasing a subject or a tenant: everything about it goes, a signed receipt comes."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
-from templates.store.audit_log import PROGRAM, By, Entry
+from templates.store.audit_log import PROGRAM, TENANT_ERASE, By, Entry
 from templates.store.context import StoreContext
-from templates.store.identifiers import checked_subject_id
-from templates.store.receipts import Erased, Receipt, keep_receipt, latest_receipt
+from templates.store.identifiers import UnknownTenant, checked_subject_id, checked_tenant_name
+from templates.store.receipts import (
+    Receipt,
+    keep_receipt,
+    latest_receipt,
+    tenant_receipt_name,
+)
 from templates.store.schema import (
+    ApiKeyRow,
     FailedAttemptsRow,
+    RotationKeyRow,
     SubjectRow,
     TemplateRow,
     TenantRow,
 )
-from templates.store.subject_rows import subject_lock, subject_pk_of, tenant_id_of
+from templates.store.subject_rows import subject_pk_of
+from templates.store.tenants import tenant_id_of, tenant_of
 
 
 @dataclass(frozen=True)
 class Erasure:
-    """What :meth:`Erasures.erase` did.
+    """What an erasure did.
 
     Attributes
     ----------
     receipt
         The signed receipt.
     erased
-        Whether this call removed an enrollment; False when there was none (any more).
+        Whether this call removed something; False when there was nothing (any more).
     log_purged
         False if SQLite could not empty its write-ahead log just now, as beside a long reader; the
         next erasure or ``purge_log`` does it.
@@ -40,7 +49,7 @@ class Erasure:
 
 
 class Erasures:
-    """Repository of erasure receipts, and the only way to get one."""
+    """Erases subjects and tenants, and keeps their receipts."""
 
     def __init__(self, context: StoreContext) -> None:
         self._context = context
@@ -49,19 +58,16 @@ class Erasures:
         """Remove all that is held of a subject, its data key included; leave a signed receipt.
 
         In one transaction: template, metadata, data key and failed attempts go, the receipt
-        comes. Erasing again returns the receipt of the first time; erasing who
-        was never enrolled leaves a receipt that says nothing was held. The receipt counts what its
+        comes. Erasing again returns the receipt of the first time; erasing a subject that was
+        never enrolled leaves a receipt that says nothing was held. The receipt counts what its
         own call removed.
 
         What stays is the receipt, and the lines of the audit log, which name the subject by its
-        pseudonym. The nonces of challenges and tokens stay for their few minutes:
-        they belong to an API key and name no subject. As the failed attempts go, an erasure ends a
-        lock: whoever may erase and enroll a subject may also start its count anew.
+        pseudonym. As the failed attempts go, an erasure ends a lock: a caller who may erase and
+        enroll a subject may also start its count anew.
         """
-        work = self._work(tenant, subject_id, by)
-        receipt, erased = self._context.write(work, lock=subject_lock(tenant, subject_id))
-        log_purged = self._context.database.purge_log()
-        return Erasure(receipt=receipt, erased=erased, log_purged=log_purged)
+        checked_subject_id(subject_id)
+        return self._run(lambda connection: self._erase(connection, tenant, subject_id, by))
 
     def erase_if(
         self, tenant: str, subject_id: str, condition: sa.ColumnElement[bool], *, by: By
@@ -74,81 +80,115 @@ class Erasures:
             None where the subject does not meet it, or is not there; nothing is done then.
             Emptying SQLite's write-ahead log is left to the caller, who may erase many.
         """
-        work = self._work(tenant, subject_id, by)
+        checked_subject_id(subject_id)
         query = (
             sa.select(SubjectRow.id)
             .join(TenantRow, TenantRow.id == SubjectRow.tenant_id)
             .where(TenantRow.name == tenant, SubjectRow.subject_id == subject_id, condition)
         )
 
-        def work_if(connection: Connection) -> Receipt | None:
+        def work(connection: Connection) -> Receipt | None:
             if connection.execute(query).one_or_none() is None:
                 return None
-            receipt, _ = work(connection)
-            return receipt
+            return self._erase(connection, tenant, subject_id, by)[0]
 
-        return self._context.write(work_if, lock=subject_lock(tenant, subject_id))
-
-    def _work(
-        self, tenant: str, subject_id: str, by: By
-    ) -> Callable[[Connection], tuple[Receipt, bool]]:
-        """The transaction of an erasure: what was signed, and whether anybody was enrolled."""
-        signer, audit_log = self._context.signer, self._context.audit_log
-        checked_subject_id(subject_id)
-
-        def work(connection: Connection) -> tuple[Receipt, bool]:
-            pseudonym = signer.pseudonym(tenant, subject_id)
-            receipt, outcome = remove(connection, pseudonym)
-            audit_log.append(connection, Entry("erase", outcome, by, tenant, pseudonym))
-            return receipt, outcome == "erased"
-
-        def remove(connection: Connection, pseudonym: str) -> tuple[Receipt, str]:
-            tenant_id = tenant_id_of(connection, tenant)
-
-            failed_attempts = connection.execute(
-                sa.delete(FailedAttemptsRow).where(
-                    FailedAttemptsRow.tenant_id == tenant_id,
-                    FailedAttemptsRow.pseudonym == pseudonym,
-                )
-            ).rowcount
-            contract_id, templates, subjects = None, 0, 0
-            subject_pk = subject_pk_of(connection, tenant_id, subject_id)
-            if subject_pk is None:
-                earlier = latest_receipt(connection, pseudonym)
-                if earlier is not None:
-                    return earlier, "receipt_repeated"
-            else:
-                contract_id = connection.execute(
-                    sa.select(TemplateRow.contract_id).where(TemplateRow.subject_pk == subject_pk)
-                ).scalar_one()
-                templates = connection.execute(
-                    sa.delete(TemplateRow).where(TemplateRow.subject_pk == subject_pk)
-                ).rowcount
-                subjects = connection.execute(
-                    sa.delete(SubjectRow).where(SubjectRow.id == subject_pk)
-                ).rowcount
-            now = self._context.clock()
-            receipt = signer.sign(
-                tenant=tenant,
-                pseudonym=pseudonym,
-                erased=Erased(
-                    contract_id=contract_id,
-                    template=templates,
-                    data_key=subjects,  # a column of the subject's row, with the metadata
-                    metadata=subjects,
-                    failed_attempts=failed_attempts,
-                ),
-                erased_at=now,
-            )
-            keep_receipt(connection, pseudonym, receipt, now)
-            return receipt, "nothing_held" if subject_pk is None else "erased"
-
-        return work
+        return self._context.database.write(work)
 
     def receipt(self, tenant: str, subject_id: str) -> Receipt | None:
         """Return the latest erasure receipt of a subject, or None."""
-        signer = self._context.signer
-        checked_subject_id(subject_id)
-        return self._context.read(
-            lambda connection: latest_receipt(connection, signer.pseudonym(tenant, subject_id))
+        pseudonym = self._context.signer.pseudonym(tenant, checked_subject_id(subject_id))
+        return self._context.database.read(lambda connection: latest_receipt(connection, pseudonym))
+
+    def erase_tenant(self, tenant: str, *, by: By = PROGRAM) -> Erasure:
+        """Remove all that is held of a tenant, its keys included; leave one signed receipt.
+
+        In one transaction, for which every other write waits. Erasing again returns the receipt of
+        the first time. A tenant that is made anew under the same name later is another one.
+
+        Raises
+        ------
+        UnknownTenant
+            If there never was a tenant of this name.
+        """
+        checked_tenant_name(tenant)
+        return self._run(lambda connection: self._erase_tenant(connection, tenant, by))
+
+    def _run(self, work: Callable[[Connection], tuple[Receipt, bool]]) -> Erasure:
+        receipt, erased = self._context.database.write(work)
+        return Erasure(receipt, erased, log_purged=self._context.database.purge_log())
+
+    def _erase(
+        self, connection: Connection, tenant: str, subject_id: str, by: By
+    ) -> tuple[Receipt, bool]:
+        pseudonym = self._context.signer.pseudonym(tenant, subject_id)
+        tenant_id = tenant_id_of(connection, tenant)
+        subject_pk = subject_pk_of(connection, tenant_id, subject_id)
+        failed_attempts = _delete(
+            connection,
+            FailedAttemptsRow,
+            FailedAttemptsRow.tenant_id == tenant_id,
+            FailedAttemptsRow.pseudonym == pseudonym,
         )
+        receipt = None if subject_pk else latest_receipt(connection, pseudonym)
+        outcome = "receipt_repeated"
+        if receipt is None:
+            contract_id = connection.execute(
+                sa.select(TemplateRow.contract_id).where(TemplateRow.subject_pk == subject_pk)
+            ).scalar_one_or_none()
+            # Its template goes with the subject, by the foreign key.
+            subjects = _delete(connection, SubjectRow, SubjectRow.id == subject_pk)
+            outcome, now = "erased" if subjects else "nothing_held", self._context.clock()
+            receipt = self._context.signer.sign(
+                tenant=tenant,
+                pseudonym=pseudonym,
+                contract_id=contract_id,
+                # The data key is a column of the subject's row, with the metadata.
+                erased={
+                    **dict.fromkeys(("template", "data_key", "metadata"), subjects),
+                    "failed_attempts": failed_attempts,
+                },
+                erased_at=now,
+            )
+            keep_receipt(connection, pseudonym, receipt, now)
+        self._context.audit_log.append(connection, Entry("erase", outcome, by, tenant, pseudonym))
+        return receipt, outcome == "erased"
+
+    def _erase_tenant(self, connection: Connection, tenant: str, by: By) -> tuple[Receipt, bool]:
+        name, now = tenant_receipt_name(tenant), self._context.clock()
+        try:
+            owner = tenant_of(connection, tenant)
+        except UnknownTenant:
+            earlier = latest_receipt(connection, name)
+            if earlier is None:
+                raise
+            entry = Entry(TENANT_ERASE, "receipt_repeated", by, tenant)
+            self._context.audit_log.append(connection, entry)
+            return earlier, False
+        erased = _counts(connection, owner.id)
+        # Everything else of the tenant goes with its row, by the foreign keys.
+        _delete(connection, TenantRow, TenantRow.id == owner.id)
+        receipt = self._context.signer.sign_tenant(
+            tenant=tenant, rotation_epoch=owner.rotation_epoch, erased=erased, erased_at=now
+        )
+        keep_receipt(connection, name, receipt, now)
+        self._context.audit_log.append(connection, Entry(TENANT_ERASE, "erased", by, tenant))
+        return receipt, True
+
+
+def _delete(connection: Connection, table: type[Any], *conditions: Any) -> int:
+    return connection.execute(sa.delete(table).where(*conditions)).rowcount
+
+
+def _counts(connection: Connection, tenant_id: str) -> dict[str, int]:
+    """Count the records of a tenant, each kind in the table that holds it."""
+
+    def count(table: type[Any]) -> int:
+        query = sa.select(sa.func.count()).select_from(table).where(table.tenant_id == tenant_id)
+        return int(connection.execute(query).scalar_one())
+
+    return {
+        **dict.fromkeys(("subjects", "templates", "data_keys"), count(SubjectRow)),
+        "rotation_keys": count(RotationKeyRow),
+        "api_keys": count(ApiKeyRow),
+        "failed_attempts": count(FailedAttemptsRow),
+    }

@@ -27,7 +27,7 @@ class UnknownTenant(StoreError):
     """No tenant of this name."""
 
     @classmethod
-    def named(cls, name: str) -> "UnknownTenant":
+    def of_name(cls, name: str) -> "UnknownTenant":
         """The error of a name that no tenant has."""
         return cls(f"there is no tenant {name!r}")
 

@@ -1,13 +1,31 @@
 """When a subject is locked after failed attempts, and why a probe is refused without a decision."""
 
-import hashlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import datetime, timedelta
 
 from templates.errors import StoreBusy, StoreError
-from templates.keys.sealing import encode_parts
 
 _MAX_DOUBLINGS = 64
+
+
+@dataclass(frozen=True)
+class AttemptsStatus:
+    """Failures on a subject; `consecutive` counts from the last accept or reset on."""
+
+    consecutive: int
+    total: int
+    last_failed_at: datetime
+    locked_until: datetime | None
+    disabled_at: datetime | None
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether there is nothing that a reset would lift."""
+        return self.consecutive == 0 and self.locked_until is None and self.disabled_at is None
+
+    def cleared(self) -> "AttemptsStatus":
+        """After an accept or a reset: the total stays."""
+        return AttemptsStatus(0, self.total, self.last_failed_at, None, None)
 
 
 @dataclass(frozen=True)
@@ -42,28 +60,37 @@ class LockoutPolicy:
         if self.after and self.disable_at < self.after:
             raise StoreError("a subject is disabled after no fewer failures than lock it")
 
-    def disables(self, consecutive: int) -> bool:
-        """Whether so many failures disable the subject."""
-        return bool(self.after) and consecutive >= self.disable_at
+    def after_failure(self, status: AttemptsStatus | None, now: datetime) -> AttemptsStatus:
+        """Status of a subject that has just failed once more."""
+        consecutive, total = (0, 0) if status is None else (status.consecutive, status.total)
+        consecutive, total = consecutive + 1, total + 1
+        locked_until = disabled_at = None
+        if self.after and consecutive >= self.after:
+            doublings = min(consecutive - self.after, _MAX_DOUBLINGS)
+            seconds = min(self.first_s * 2.0**doublings, self.longest_s)
+            locked_until = now + timedelta(seconds=seconds)
+            disabled_at = now if consecutive >= self.disable_at else None
+        return AttemptsStatus(consecutive, total, now, locked_until, disabled_at)
 
-    def lock(self, consecutive: int) -> timedelta | None:
-        """Lock that follows so many failures; None for none."""
-        if not self.after or consecutive < self.after:
-            return None
-        doublings = min(consecutive - self.after, _MAX_DOUBLINGS)
-        return timedelta(seconds=min(self.first_s * 2.0**doublings, self.longest_s))
+    def refuse_locked(self, status: AttemptsStatus | None, now: datetime) -> None:
+        """Raise :class:`LockedOut` where the subject is locked now.
+
+        A lock that began later than now, by more than its own length, does not hold: the clock was
+        set back, and the lock would last until the earlier time comes again.
+        """
+        if not self.after or status is None:
+            return
+        if status.disabled_at is not None:
+            raise LockedOut(None)
+        until = status.locked_until
+        if until is None or now >= until:
+            return
+        if status.last_failed_at - now < until - status.last_failed_at:
+            raise LockedOut((until - now).total_seconds())
 
 
 class Superseded(StoreBusy):
-    """The template that was decided on is no longer the subject's: decide again.
-
-    Attributes
-    ----------
-    recorded
-        False: nothing was written, and the nonce was not used up.
-    """
-
-    recorded = False
+    """The template that was decided on is no longer the subject's; nothing was written."""
 
     def __init__(self) -> None:
         super().__init__(
@@ -97,7 +124,7 @@ class LockedOut(StoreError):
 
 
 class Replayed(StoreError):
-    """An answer to a challenge, or a token, that was seen before.
+    """A token, or an answer to a challenge, that was used before or comes too late.
 
     Attributes
     ----------
@@ -109,26 +136,9 @@ class Replayed(StoreError):
 
     def __init__(
         self,
-        message: str = "this was seen before: ask for another challenge or token",
+        message: str = "this was used before: ask for another token or challenge",
         *,
         recorded: bool = False,
     ) -> None:
         super().__init__(message)
         self.recorded = recorded
-
-
-@dataclass(frozen=True)
-class Nonce:
-    """The nonce of a challenge or a token; kept until its time alone refuses it.
-
-    `key_prefix` is of the key that asked for it.
-    """
-
-    key_prefix: str
-    value: str = field(repr=False)
-    expires_at: datetime
-
-    @property
-    def hash(self) -> bytes:
-        """What the store keeps of the value."""
-        return hashlib.sha256(encode_parts("nonce", self.value)).digest()

@@ -1,23 +1,20 @@
 """Signed erasure receipts.
 
 A receipt is a canonical JSON text (``templates.contract.canonical``) and its Ed25519 signature
-(RFC 8032). It names the subject by a pseudonym, HMAC-SHA256 of tenant and subject id under a key of
-the deployment: whoever holds the subject id and asks the deployment can find the receipt, nobody
-else learns whom it is about. The receipt of a whole tenant is of another kind, and names the
+(RFC 8032). It names the subject by a pseudonym, HMAC-SHA256 of tenant and subject id under a secret
+of the deployment: a caller who has the subject id can ask the deployment for the receipt, and
+nobody else learns whom it is about. The receipt of a whole tenant is of another kind, and names the
 tenant.
-
-Both keys can be renewed. A receipt under a retired key is good if it is dated before the key was
-retired; as whoever took that key can date receipts back, the renewal signs every receipt that the
-deployment keeps again.
 """
 
 import base64
 import binascii
 import hashlib
+import hmac
 import json
 import uuid
-from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any
 
@@ -29,73 +26,12 @@ from sqlalchemy.engine import Connection
 from templates.contract.canonical import canonical_json
 from templates.errors import StoreError
 from templates.keys.sealing import encode_parts
-from templates.store.deployment import Secrets
 from templates.store.schema import ReceiptRow
-from templates.store.secret import SecretName
+from templates.store.secrets import SecretName, Secrets
 
 SUBJECT_KIND = "veilface-erasure-receipt"
 TENANT_KIND = "veilface-tenant-erasure-receipt"
 _VERSION = 1
-
-
-@dataclass(frozen=True)
-class Erased:
-    """What one erasure removed, in numbers of records.
-
-    Attributes
-    ----------
-    contract_id
-        Contract of the template; None where there was none.
-    template, data_key, metadata
-        1 or 0: they come and go together.
-    failed_attempts
-        Records that named the subject by its pseudonym.
-    """
-
-    contract_id: str | None
-    template: int
-    data_key: int
-    metadata: int
-    failed_attempts: int
-
-    @property
-    def items(self) -> list[dict[str, Any]]:
-        """Every kind of record with its count, in the order above."""
-        return [
-            {"item": item.name, "count": getattr(self, item.name)}
-            for item in fields(self)
-            if item.name != "contract_id"
-        ]
-
-
-@dataclass(frozen=True)
-class ErasedTenant:
-    """What the erasure of a tenant removed, in numbers of records.
-
-    Attributes
-    ----------
-    subjects, templates, data_keys
-        A data key is a column of the subject's row.
-    rotation_keys
-        Keys of the tenant's rotation, one for each epoch that was left.
-    api_keys
-        API keys, those that were revoked or had expired before included.
-    failed_attempts, nonces
-        Records of lockout, and of challenges and tokens that were used.
-    """
-
-    subjects: int
-    templates: int
-    data_keys: int
-    rotation_keys: int
-    api_keys: int
-    failed_attempts: int
-    nonces: int
-
-    @property
-    def items(self) -> list[dict[str, Any]]:
-        """Every kind of record with its count, in the order above."""
-        return [{"item": item.name, "count": getattr(self, item.name)} for item in fields(self)]
 
 
 @dataclass(frozen=True)
@@ -144,90 +80,74 @@ class Receipt:
             raise StoreError("the signature of a receipt is base64") from None
 
 
-@dataclass(frozen=True)
-class ReceiptKey:
-    """What receipts are verified with.
-
-    Attributes
-    ----------
-    public_key
-        32 bytes, Ed25519.
-    retired_at
-        When it was replaced; None while it is in force, or where nobody says.
-    """
-
-    public_key: bytes = field(repr=False)
-    retired_at: datetime | None = None
-
-    @property
-    def key_id(self) -> str:
-        """:func:`key_fingerprint` of it."""
-        return key_fingerprint(self.public_key)
-
-
 class ReceiptSigner:
-    """Makes pseudonyms and receipts with the deployment's keys."""
+    """Makes pseudonyms and receipts with the deployment's secrets."""
 
     def __init__(self, secrets: Secrets) -> None:
         self._secrets = secrets
 
-    def prepare(self) -> None:
-        """Obtain the keys; to be called before a transaction that needs them."""
-        self._secrets.get(SecretName.PSEUDONYM)
-        self._secrets.get(SecretName.RECEIPT)
-
     def pseudonym(self, tenant: str, subject_id: str) -> str:
         """Keyed pseudonym, 64 hexadecimal digits, of one subject of one tenant."""
-        return self.pseudonyms(tenant, subject_id)[0]
-
-    def pseudonyms(self, tenant: str, subject_id: str) -> tuple[str, ...]:
-        """:meth:`pseudonym`, and behind it those that older lines of the audit log name."""
-        digests = self._secrets.get(SecretName.PSEUDONYM).digests(encode_parts(tenant, subject_id))
-        return tuple(digest.hex() for digest in digests)
-
-    def keys(self) -> tuple[ReceiptKey, ...]:
-        """Keys that verify this deployment's receipts: the one in force, then the retired ones."""
-        secret = self._secrets.get(SecretName.RECEIPT)
-        retired = (ReceiptKey(public_key_of(key.value), key.at) for key in reversed(secret.retired))
-        return ReceiptKey(public_key_of(secret.value)), *retired
+        secret = self._secrets.get(SecretName.PSEUDONYM)
+        return hmac.digest(secret, encode_parts(tenant, subject_id), hashlib.sha256).hex()
 
     def public_key(self) -> bytes:
-        """The 32 bytes that verify the receipts that are signed now."""
-        return public_key_of(self._secrets.get(SecretName.RECEIPT).value)
+        """The 32 bytes that verify this deployment's receipts."""
+        return public_key_of(self._secrets.get(SecretName.RECEIPT))
 
-    def sign(self, *, tenant: str, pseudonym: str, erased: Erased, erased_at: datetime) -> Receipt:
-        """Write and sign the receipt of a subject, with a random id of its own."""
+    def sign(
+        self,
+        *,
+        tenant: str,
+        pseudonym: str,
+        contract_id: str | None,
+        erased: Mapping[str, int],
+        erased_at: datetime,
+    ) -> Receipt:
+        """Write and sign the receipt of a subject, with a random id of its own.
+
+        Parameters
+        ----------
+        contract_id
+            Contract of the template; None where nothing was held.
+        erased
+            Number of records of each kind that went.
+        """
         return self._signed(
             SUBJECT_KIND,
+            erased,
             erased_at,
             tenant=tenant,
             subject=pseudonym,
-            held=erased.contract_id is not None,
-            contract_id=erased.contract_id,
-            erased=erased.items,
+            held=contract_id is not None,
+            contract_id=contract_id,
         )
 
     def sign_tenant(
-        self, *, tenant: str, rotation_epoch: int, erased: ErasedTenant, erased_at: datetime
+        self, *, tenant: str, rotation_epoch: int, erased: Mapping[str, int], erased_at: datetime
     ) -> Receipt:
         """Write and sign the receipt of a tenant, with a random id of its own."""
         return self._signed(
             TENANT_KIND,
+            erased,
             erased_at,
             tenant=tenant,
             held=True,
             rotation_epoch=rotation_epoch,
-            erased=erased.items,
         )
 
-    def _signed(self, kind: str, erased_at: datetime, **claims: Any) -> Receipt:
-        head = {
+    def _signed(
+        self, kind: str, erased: Mapping[str, int], erased_at: datetime, **claims: Any
+    ) -> Receipt:
+        body = {
             "kind": kind,
             "version": _VERSION,
             "receipt_id": uuid.uuid4().hex,
             "erased_at": erased_at.isoformat(),
+            **claims,
+            "erased": [{"item": item, "count": count} for item, count in erased.items()],
         }
-        return sign_claims({**head, **claims}, self._secrets.get(SecretName.RECEIPT).value)
+        return sign_claims(body, self._secrets.get(SecretName.RECEIPT))
 
 
 def sign_claims(claims: dict[str, Any], private_key: bytes) -> Receipt:
@@ -268,7 +188,7 @@ def keep_receipt(connection: Connection, pseudonym: str, receipt: Receipt, now: 
 def latest_receipt(connection: Connection, pseudonym: str) -> Receipt | None:
     """The last receipt that :func:`keep_receipt` stored under a name, or None."""
     row = connection.execute(
-        sa.select(ReceiptRow.body, ReceiptRow.signature)
+        sa.select(*_RECEIPT)
         .where(ReceiptRow.pseudonym == pseudonym)
         .order_by(ReceiptRow.sequence.desc())
         .limit(1)
@@ -308,32 +228,22 @@ def verify_receipt(receipt: Receipt, public_key: bytes) -> dict[str, Any]:
     return claims
 
 
-def verify_under(receipt: Receipt, keys: Sequence[ReceiptKey]) -> tuple[dict[str, Any], ReceiptKey]:
-    """:func:`verify_receipt` under one of several keys; returns the key too.
+def sign_again(connection: Connection, old_key: bytes, new_key: bytes) -> int:
+    """Sign every receipt that the deployment keeps anew, in a write; returns how many.
 
-    Raises
-    ------
-    StoreError
-        As there, and if the key was retired before the time that the receipt names.
+    One whose signature under the old private key does not hold stays as it is.
     """
-    error = StoreError("a receipt is verified with at least one key")
-    for key in keys:
+    public_key, count = public_key_of(old_key), 0
+    for row in connection.execute(sa.select(ReceiptRow.sequence, *_RECEIPT)).all():
         try:
-            claims = verify_receipt(receipt, key.public_key)
-        except StoreError as refusal:
-            error = refusal
+            claims = verify_receipt(Receipt(row.body, row.signature), public_key)
+        except StoreError:
             continue
-        if key.retired_at is not None and not _is_before(claims, key.retired_at):
-            raise StoreError(
-                f"the receipt is dated after its key {key.key_id} was retired: somebody signed it "
-                "who took that key"
-            )
-        return claims, key
-    raise error
+        receipt = sign_claims(claims, new_key)
+        statement = sa.update(ReceiptRow).where(ReceiptRow.sequence == row.sequence)
+        connection.execute(statement.values(body=receipt.body, signature=receipt.signature))
+        count += 1
+    return count
 
 
-def _is_before(claims: dict[str, Any], time: datetime) -> bool:
-    try:
-        return datetime.fromisoformat(claims["erased_at"]) <= time
-    except (KeyError, TypeError, ValueError):
-        return False
+_RECEIPT = (ReceiptRow.body, ReceiptRow.signature)

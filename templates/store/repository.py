@@ -1,41 +1,45 @@
 """The store of a deployment, opened from a URL and a keyring."""
 
 import os
+from collections.abc import Callable
+from pathlib import Path
 
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
 from templates.keys.sealing import MasterKeyring
-from templates.store import deployment, migrate
+from templates.store import migrate
 from templates.store.api_keys import ApiKeys
 from templates.store.attempts import Attempts
+from templates.store.audit_archive import Archive, archive_lines
+from templates.store.audit_log import PROGRAM, Anchor, BrokenAuditLog, By, Verification
 from templates.store.context import StoreContext
 from templates.store.database import Database
 from templates.store.erasure import Erasures
+from templates.store.evidence import RecordProblem, verify_log_and_records
 from templates.store.identifiers import Clock, utc_now
 from templates.store.lockout import LockoutPolicy
-from templates.store.nonces import Nonces
-from templates.store.record_check import RecordProblem, check_records
-from templates.store.renewal import Renewal
+from templates.store.renewal import Renewed, renew_secrets
 from templates.store.rerotation import Rerotation
 from templates.store.retention import RetentionJob
 from templates.store.rewrap import WrappedKeys
 from templates.store.schema import (
     ApiKeyRow,
+    AuditHeadRow,
     FailedAttemptsRow,
-    MasterKeyCheckRow,
     RotationKeyRow,
+    SecretRow,
     SubjectRow,
     TemplateRow,
-    UsedNonceRow,
 )
+from templates.store.secrets import SecretName
 from templates.store.subjects import Subjects
-from templates.store.tenant_erasure import TenantErasures
 from templates.store.tenants import Tenants
 
 _LOCKOUT = LockoutPolicy()
-_TRIAL_ROW = 0  # the table's one row has number 1
+_TRIAL_NAME = "trial-write"
 _TRIAL_BYTES = 128 * 1024
+_HOLD_SUBJECT_DATA = (SubjectRow, TemplateRow, FailedAttemptsRow, RotationKeyRow, ApiKeyRow)
 
 
 class TemplateStore:
@@ -56,40 +60,67 @@ class TemplateStore:
         lockout: LockoutPolicy = _LOCKOUT,
     ) -> None:
         database = Database(url, pool_size=pool_size, max_overflow=max_overflow, timeout=timeout)
-        self._context = context = StoreContext.of(database, keyring, clock)
+        self._context = context = StoreContext.open(database, keyring, clock)
         self.database = database
         self.secrets = context.secrets
         self.signer = context.signer
         self.audit_log = context.audit_log
         self.tenants = Tenants(context)
         self.api_keys = ApiKeys(context, self.tenants)
-        self.nonces = Nonces(context)
-        self.subjects = Subjects(context, self.nonces)
-        self.attempts = Attempts(context, self.nonces, lockout)
+        self.subjects = Subjects(context)
+        self.attempts = Attempts(context, lockout)
         self.erasures = Erasures(context)
         self.retention = RetentionJob(context, self.erasures)
         self.rerotation = Rerotation(context, self.tenants)
-        self.tenant_erasures = TenantErasures(context, self.tenants, self.api_keys)
         self.wrapped_keys = WrappedKeys(context)
-        self.renewal = Renewal(context, self.tenants)
 
     def upgrade(self) -> None:
-        """Bring the schema to this program's version; safe when several workers start at once."""
-        context = self._context
+        """Bring the schema to this program's version; safe when several workers start at once.
+
+        Raises
+        ------
+        BrokenAuditLog
+            If the audit log has begun, and its secret is gone.
+        SealError
+            If the database was made with another master key.
+        """
         migrate.upgrade(self.database)
-        deployment.mark_master_key(self.database, context.keyring, context.clock)
+        self.database.write(self._set_up)
         self.check()
-        self.audit_log.begin()
-        self.signer.prepare()  # so that the first reader makes no secret, which is a write
+
+    def _set_up(self, connection: Connection) -> None:
+        made = self.secrets.make_missing(connection)
+        if SecretName.CHAIN not in made:
+            return
+        if connection.execute(sa.select(AuditHeadRow.id)).first() is not None:
+            raise BrokenAuditLog(
+                "the secret of the audit log is missing: restore the database from a backup"
+            )
+        query = sa.select(SecretRow.wrapped_value).where(SecretRow.name == SecretName.CHAIN)
+        sealed = connection.execute(query).scalar_one()
+        self.audit_log.begin(connection, self.secrets.opened(SecretName.CHAIN, sealed))
 
     def check(self) -> None:
         """Raise, naming the remedy, unless schema and master key are the right ones."""
         migrate.check(self.database)
-        deployment.check_master_key(self.database, self._context.keyring)
+        self.secrets.load()
+        self.secrets.get(SecretName.CHAIN)
 
-    def check_records(self) -> tuple[RecordProblem, ...]:
-        """Hold the rows that decide against the audit log; see :func:`check_records`."""
-        return check_records(self._context)
+    def verify_audit_log(
+        self, *, anchor: Anchor | None = None, progress: Callable[[int], None] | None = None
+    ) -> tuple[Verification, tuple[RecordProblem, ...]]:
+        """Walk over the audit log, and hold rows against it (:func:`verify_log_and_records`)."""
+        return verify_log_and_records(
+            self._context, self.api_keys, anchor=anchor, progress=progress
+        )
+
+    def archive_audit_log(self, file: Path, *, through: int | None, by: By = PROGRAM) -> Archive:
+        """Move old lines of the audit log into a file (:func:`archive_lines`)."""
+        return archive_lines(self._context, file, through=through, by=by)
+
+    def renew_secrets(self, archive: Path, *, by: By = PROGRAM) -> Renewed:
+        """Make every secret anew after a theft (:func:`renew_secrets`)."""
+        return renew_secrets(self._context, self.api_keys, archive, by=by)
 
     def close(self) -> None:
         """Close the idle connections of this process."""
@@ -105,8 +136,8 @@ class TemplateStore:
         A full disk and a read-only database still answer queries. On a full disk a page or two
         often find room that an enrollment does not, so this writes as much as one.
         """
-        trial = sa.insert(MasterKeyCheckRow).values(
-            id=_TRIAL_ROW,
+        trial = sa.insert(SecretRow).values(
+            name=_TRIAL_NAME,
             wrapped_value=os.urandom(_TRIAL_BYTES),
             wrapping_key="",
             created_at=self._context.clock(),
@@ -114,12 +145,9 @@ class TemplateStore:
 
         def work(connection: Connection) -> None:
             connection.execute(trial)
-            connection.execute(
-                sa.delete(MasterKeyCheckRow).where(MasterKeyCheckRow.id == _TRIAL_ROW)
-            )
+            connection.execute(sa.delete(SecretRow).where(SecretRow.name == _TRIAL_NAME))
 
-        # One at a time: on PostgreSQL another worker's trial has the same row, not yet removed.
-        self.database.write(work, lock="trial write")
+        self.database.write(work)
 
     def purge(self) -> bool:
         """Remove expired records, and on SQLite empty the write-ahead log.
@@ -140,13 +168,3 @@ class TemplateStore:
         the free pages back to the file system.
         """
         self.database.compact([table.__tablename__ for table in _HOLD_SUBJECT_DATA])
-
-
-_HOLD_SUBJECT_DATA = (
-    SubjectRow,
-    TemplateRow,
-    FailedAttemptsRow,
-    RotationKeyRow,
-    ApiKeyRow,
-    UsedNonceRow,
-)

@@ -16,15 +16,10 @@ distance of a probe to the template then differs from the one before by 1.3·10�
 square, and by 8·10⁻⁵ at most over 400,000 pairs: as much as the first rounding costs
 (``tests/templates/store/test_rerotation.py``). They add up like independent errors: after three
 moves the distance is 2.6·10⁻⁵ from that to the template before any rounding.
-
-A template of another contract is not turned: it stays in its epoch, whose key is kept until the
-subject is enrolled again or erased.
 """
 
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any
 
 import sqlalchemy as sa
@@ -37,19 +32,18 @@ from templates.keys.rotation import TenantRotation
 from templates.keys.sealing import sealed_key_id
 from templates.store.audit_log import PROGRAM, By, Entry
 from templates.store.context import StoreContext
-from templates.store.envelope import Owner, close_envelope, open_envelope
+from templates.store.envelope import Owner, close_envelope
 from templates.store.schema import RotationKeyRow, SubjectRow, TemplateRow, TenantRow
-from templates.store.subject_rows import TEMPLATE_COLUMNS, envelope_of, owner_of
-from templates.store.tenants import RetiredRotation, Tenants
+from templates.store.subject_rows import TEMPLATE_COLUMNS, opened_template, owner_of
+from templates.store.tenants import RetiredRotation, Tenant, Tenants, tenant_of
 
 ACTION = "tenant-rotate"
 BATCH = 50
-_PAUSE_S = 0.05
 
 
 @dataclass(frozen=True)
 class _Rotated:
-    """A template in the new epoch, and the row that it replaces, with ``TEMPLATE_COLUMNS``."""
+    """A template in the new epoch, and the row that it replaces."""
 
     row: Any = field(repr=False)
     owner: Owner
@@ -74,14 +68,15 @@ class Rerotation:
         """
 
         def work(connection: Connection) -> int:
-            owner = self._tenants.locked(connection, tenant)
+            owner = tenant_of(connection, tenant)
             epoch = owner.rotation_epoch + 1
             self._tenants.add_rotation_key(connection, owner.id, epoch)
-            entry = _entry("begun", tenant, epoch, by)
-            self._tenants.change(connection, owner, entry, rotation_epoch=epoch)
+            change = sa.update(TenantRow).where(TenantRow.id == owner.id)
+            connection.execute(change.values(rotation_epoch=epoch))
+            self._note(connection, "begun", tenant, epoch, by)
             return epoch
 
-        return self._context.write(work)
+        return self._context.database.write(work)
 
     def move(
         self,
@@ -118,39 +113,37 @@ class Rerotation:
         StoreError
             At the end, if templates do not open or are none: :meth:`subjects_of_old_epochs` names
             their subjects, which must be enrolled again or erased. All others are moved.
-        StoreUnavailable
-            If a write that was under way at the start does not end within the timeout.
         """
         owner, database = self._tenants.get(tenant), self._context.database
-        # An enrollment that read the epoch before the renewal may commit into the old one still.
-        database.await_writers()
         rotations = _Rotations(self._tenants, tenant, binding)
-        total, broken = 0, set[str]()
-        while True:
-            moved, left, after = 0, 0, ""
-            broken_before, broken = broken, set()
-            while rows := database.read(
-                partial(_old_templates, owner.id, binding.contract_id, after, batch)
-            ):
-                after = rows[-1].subject_pk
-                rotated = self._rotate_all(rotations, rows, broken)
-                changed = database.write(partial(self._replace_all, rotated=rotated))
-                moved, left = moved + changed, left + len(rotated) - changed
-                if progress is not None and changed:
-                    progress(changed)
-            total += moved
-            # What did not open may have been half seen: only what fails twice is broken.
-            if not left and broken <= broken_before:
-                break
-            if not moved:
-                time.sleep(_PAUSE_S)  # another write holds them
+        query = (
+            sa.select(*TEMPLATE_COLUMNS)
+            .join(TemplateRow, TemplateRow.subject_pk == SubjectRow.id)
+            .where(_is_older(owner), TemplateRow.contract_id == binding.contract_id)
+            .order_by(SubjectRow.id)
+            .limit(batch)
+        )
+        total = broken = 0
+        after = ""
+        while rows := self._after(query, SubjectRow.id, after):
+            after = rows[-1].subject_pk
+            rotated, failed = self._rotate_all(rotations, rows, owner.rotation_epoch)
+            changed = database.write(
+                lambda connection, rotated=rotated: sum(  # type: ignore[misc]
+                    self._replace(connection, template) for template in rotated
+                )
+            )
+            total, broken = total + changed, broken + failed
+            if progress is not None and changed:
+                progress(changed)
         database.purge_log()
         if total:
-            entry = _entry("moved", tenant, rotations.current_epoch(), by)
-            self._context.audit_log.record(entry)
+            database.write(
+                lambda connection: self._note(connection, "moved", tenant, owner.rotation_epoch, by)
+            )
         if broken:
             raise StoreError(
-                f"{len(broken)} templates of tenant {tenant!r} could not be moved to its new "
+                f"{broken} templates of tenant {tenant!r} could not be moved to its new "
                 "rotation: their rows were altered, or a master key is missing. Put the key back "
                 "and run it again, or enroll these subjects again, or erase them"
             )
@@ -158,16 +151,23 @@ class Rerotation:
 
     def remaining(self, tenant: str) -> int:
         """Number of the tenant's templates that are not in its current epoch."""
-        owner = self._tenants.get(tenant)
-        return self._context.database.read(lambda connection: _count(connection, _is_old(owner.id)))
+        return self._context.database.read(
+            lambda connection: _count_older(connection, tenant_of(connection, tenant))
+        )
 
     def subjects_of_old_epochs(self, tenant: str, *, batch: int = 1000) -> Iterator[str]:
         """Ids, in order, of the subjects whose templates are not in the current epoch."""
         owner, after = self._tenants.get(tenant), ""
-        database = self._context.database
-        while names := database.read(partial(_old_subjects, owner.id, after, batch)):
-            yield from names
-            after = names[-1]
+        query = (
+            sa.select(SubjectRow.subject_id)
+            .join(TemplateRow, TemplateRow.subject_pk == SubjectRow.id)
+            .where(_is_older(owner))
+            .order_by(SubjectRow.subject_id)
+            .limit(batch)
+        )
+        while rows := self._after(query, SubjectRow.subject_id, after):
+            for (after,) in rows:
+                yield after
 
     def retire(self, tenant: str, *, by: By = PROGRAM) -> int:
         """Drop the keys of all epochs but the current one; returns how many.
@@ -177,69 +177,62 @@ class Rerotation:
         UnknownTenant
         StoreError
             If templates of older epochs are left.
-        StoreUnavailable
-            If a write that was under way at the start does not end within the timeout.
         """
-        # The epoch is read before the wait. Writes that begin later know it, or a newer one, and
-        # store no template in an earlier one.
-        owner, database = self._tenants.get(tenant), self._context.database
-        database.await_writers()
 
         def work(connection: Connection) -> int:
-            older = sa.and_(
-                SubjectRow.tenant_id == owner.id, TemplateRow.rotation_epoch < owner.rotation_epoch
-            )
-            if left := _count(connection, older):
+            owner = tenant_of(connection, tenant)
+            if left := _count_older(connection, owner):
                 raise StoreError(
                     f"{left} templates of tenant {tenant!r} are still in an older rotation: "
-                    "move them first, and enroll again the subjects of another contract"
+                    "move them first, and enroll again the subjects that cannot be moved"
                 )
-            dropped = connection.execute(
-                sa.delete(RotationKeyRow).where(
-                    RotationKeyRow.tenant_id == owner.id,
-                    RotationKeyRow.epoch < owner.rotation_epoch,
-                )
-            ).rowcount
+            older = sa.delete(RotationKeyRow).where(
+                RotationKeyRow.tenant_id == owner.id, RotationKeyRow.epoch < owner.rotation_epoch
+            )
+            dropped = connection.execute(older).rowcount
             if dropped:
-                entry = _entry("retired", tenant, owner.rotation_epoch, by)
-                self._context.audit_log.append(connection, entry)
+                self._note(connection, "retired", tenant, owner.rotation_epoch, by)
             return dropped
 
-        dropped = self._context.write(work)
-        database.purge_log()
+        dropped = self._context.database.write(work)
+        self._context.database.purge_log()
         return dropped
 
+    def _after(self, query: Any, column: Any, after: str) -> Sequence[Any]:
+        return self._context.database.read(
+            lambda connection: connection.execute(query.where(column > after)).all()
+        )
+
+    def _note(self, connection: Connection, outcome: str, tenant: str, epoch: int, by: By) -> None:
+        entry = Entry(ACTION, outcome, by, tenant, detail=f"epoch {epoch}")
+        self._context.audit_log.append(connection, entry)
+
     def _rotate_all(
-        self, rotations: "_Rotations", rows: Sequence[Any], broken: set[str]
-    ) -> list[_Rotated]:
-        epoch, rotated = rotations.current_epoch(), []
+        self, rotations: "_Rotations", rows: Sequence[Any], epoch: int
+    ) -> tuple[list[_Rotated], int]:
+        rotated, broken = [], 0
         for row in rows:
             try:
-                stored = open_envelope(envelope_of(row), owner_of(row), self._context.keyring)
-                rotated.append(rotations.rotated(row, stored, epoch))
+                stored = opened_template(row, self._context.keyring)
+                rotated.append(rotations.rotated(row, stored.wire, epoch))
             except (SealError, TemplateError, RetiredRotation):
-                broken.add(row.subject_pk)
-        return rotated
-
-    def _replace_all(self, connection: Connection, *, rotated: Sequence[_Rotated]) -> int:
-        return sum(self._replace(connection, template) for template in rotated)
+                broken += 1
+        return rotated, broken
 
     def _replace(self, connection: Connection, rotated: _Rotated) -> bool:
         """Put the rotated template in the place of the one read, if that is still there."""
         row = rotated.row
-        # A row that another write holds is looked at again, rather than waited for: an erasure
-        # takes the two rows in the other order.
-        unchanged = connection.execute(
-            sa.select(SubjectRow.id)
-            .join(TemplateRow, TemplateRow.subject_pk == SubjectRow.id)
-            .where(
-                SubjectRow.id == row.subject_pk,
-                SubjectRow.wrapped_key == row.wrapped_key,
-                TemplateRow.ciphertext == row.ciphertext,
-            )
-            .with_for_update(skip_locked=True)
-        ).one_or_none()
-        if unchanged is None:
+        is_same = sa.and_(
+            TemplateRow.subject_pk == row.subject_pk,
+            TemplateRow.template_id == row.template_id,
+            TemplateRow.rotation_epoch == row.rotation_epoch,
+            # Once more begun meanwhile, the key of this epoch may be gone before the next move.
+            sa.exists().where(
+                TenantRow.id == row.tenant_id,
+                TenantRow.rotation_epoch == rotated.owner.rotation_epoch,
+            ),
+        )
+        if connection.execute(sa.select(TemplateRow.template_id).where(is_same)).first() is None:
             return False
         new = close_envelope(rotated.wire, rotated.owner, self._context.keyring)
         connection.execute(
@@ -250,21 +243,13 @@ class Rerotation:
         connection.execute(
             sa.update(TemplateRow)
             .where(TemplateRow.subject_pk == row.subject_pk)
-            .values(
-                contract_id=rotated.owner.contract_id,
-                rotation_epoch=rotated.owner.rotation_epoch,
-                ciphertext=new.ciphertext,
-            )
+            .values(rotation_epoch=rotated.owner.rotation_epoch, ciphertext=new.ciphertext)
         )
         return True
 
 
-def _entry(outcome: str, tenant: str, epoch: int, by: By) -> Entry:
-    return Entry(ACTION, outcome, by, tenant=tenant, detail=f"epoch {epoch}")
-
-
 class _Rotations:
-    """Brings templates of one tenant from one epoch, and rotation version, into another."""
+    """The rotations of one tenant and contract, by epoch."""
 
     def __init__(self, tenants: Tenants, tenant: str, binding: Binding) -> None:
         self._tenants = tenants
@@ -272,72 +257,36 @@ class _Rotations:
         self._binding = binding
         self._of_epochs: dict[int, TenantRotation] = {}
 
-    def current_epoch(self) -> int:
-        return self._tenants.get(self._tenant).rotation_epoch
-
     def rotated(self, row: Any, stored: bytes, epoch: int) -> _Rotated:
         """Turn the wire bytes of a row's template as the contract's templates of an epoch are."""
         binding, template = self._binding, wire.decode(stored)
         shape = template.subspace.n, template.subspace.m
         if template.contract_id != row.contract_id or shape != (binding.axes, binding.m):
             raise InvalidTemplate("a stored template is not of the contract that its row names")
-        old = self._of(row.rotation_epoch).of(row.template_id)
-        new = self._of(epoch).of(row.template_id)
+        old = self._rotation(row.rotation_epoch).of(row.template_id)
+        new = self._rotation(epoch).of(row.template_id)
         turned = template.subspace.turned_by(lambda points: new.turned(old.turned_back(points)))
-        owner = replace(owner_of(row), contract_id=binding.contract_id, rotation_epoch=epoch)
         data = wire.encode(turned, contract_id=binding.contract_id, dtype=template.dtype)
-        return _Rotated(row, owner, data)
+        return _Rotated(row, replace(owner_of(row), rotation_epoch=epoch), data)
 
-    def _of(self, epoch: int) -> TenantRotation:
+    def _rotation(self, epoch: int) -> TenantRotation:
         if epoch not in self._of_epochs:
             key = self._tenants.rotation_key(self._tenant, epoch=epoch).key
             self._of_epochs[epoch] = TenantRotation(key, self._binding.axes)
         return self._of_epochs[epoch]
 
 
-def _current_epoch(tenant_id: str) -> sa.ScalarSelect[int]:
-    return sa.select(TenantRow.rotation_epoch).where(TenantRow.id == tenant_id).scalar_subquery()
-
-
-def _is_old(tenant_id: str) -> sa.ColumnElement[bool]:
+def _is_older(owner: Tenant) -> sa.ColumnElement[bool]:
     return sa.and_(
-        SubjectRow.tenant_id == tenant_id, TemplateRow.rotation_epoch != _current_epoch(tenant_id)
+        SubjectRow.tenant_id == owner.id, TemplateRow.rotation_epoch < owner.rotation_epoch
     )
 
 
-def _count(connection: Connection, condition: sa.ColumnElement[bool]) -> int:
+def _count_older(connection: Connection, owner: Tenant) -> int:
     query = (
         sa.select(sa.func.count())
         .select_from(SubjectRow)
         .join(TemplateRow, TemplateRow.subject_pk == SubjectRow.id)
-        .where(condition)
+        .where(_is_older(owner))
     )
     return int(connection.execute(query).scalar_one())
-
-
-def _old_subjects(tenant_id: str, after: str, batch: int, connection: Connection) -> Sequence[str]:
-    query = (
-        sa.select(SubjectRow.subject_id)
-        .join(TemplateRow, TemplateRow.subject_pk == SubjectRow.id)
-        .where(_is_old(tenant_id), SubjectRow.subject_id > after)
-        .order_by(SubjectRow.subject_id)
-        .limit(batch)
-    )
-    return connection.execute(query).scalars().all()
-
-
-def _old_templates(
-    tenant_id: str, contract_id: str, after: str, batch: int, connection: Connection
-) -> Sequence[Any]:
-    query = (
-        sa.select(*TEMPLATE_COLUMNS)
-        .join(TemplateRow, TemplateRow.subject_pk == SubjectRow.id)
-        .where(
-            _is_old(tenant_id),
-            TemplateRow.contract_id == contract_id,
-            SubjectRow.id > after,
-        )
-        .order_by(SubjectRow.id)
-        .limit(batch)
-    )
-    return connection.execute(query).all()

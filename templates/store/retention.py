@@ -5,27 +5,20 @@ of its own. That transaction asks once more whether the subject is still due, so
 enrolled again or accepted since the list was read survives.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
-from functools import partial
-from typing import Any
 
 import sqlalchemy as sa
-from sqlalchemy.engine import Connection
 
 from templates.errors import StoreError
 from templates.store.audit_log import By
 from templates.store.context import StoreContext
 from templates.store.erasure import Erasures
-from templates.store.identifiers import UnknownTenant
-from templates.store.schema import SubjectRow, TenantRow, UtcDateTime
+from templates.store.schema import SubjectRow, TenantRow
 
 BATCH = 100
 LONGEST = timedelta(days=36_500)
 RETENTION = By("retention")
-
-Place = tuple[datetime, str]  # in the list of who is due: `updated_at` and the row's id
 
 
 @dataclass(frozen=True)
@@ -101,14 +94,27 @@ class RetentionJob:
         """
         if retention.keeps_all:
             return 0
-        database, erased = self._context.database, 0
+        database, erased, after = self._context.database, 0, ""
         expired = retention.expired(self._context.clock())
-        after: Place | None = None
-        while rows := database.read(partial(_due, expired=expired, after=after, batch=batch)):
+        due = (
+            sa.select(SubjectRow.id, TenantRow.name.label("tenant"), SubjectRow.subject_id)
+            .join(TenantRow, TenantRow.id == SubjectRow.tenant_id)
+            .where(expired)
+            .order_by(SubjectRow.id)
+            .limit(batch)
+        )
+        while rows := database.read(
+            lambda connection, after=after: connection.execute(  # type: ignore[misc]
+                due.where(SubjectRow.id > after)
+            ).all()
+        ):
             for row in rows:
-                erased += self._erase(row, expired, by)
+                # The row, too: a subject of the same name may have been enrolled anew.
+                still_due = sa.and_(SubjectRow.id == row.id, expired)
+                receipt = self._erasures.erase_if(row.tenant, row.subject_id, still_due, by=by)
+                erased += receipt is not None
             database.purge_log()
-            after = rows[-1].updated_at, rows[-1].id
+            after = rows[-1].id
         return erased
 
     def due(self, retention: Retention) -> int:
@@ -120,34 +126,3 @@ class RetentionJob:
         return self._context.database.read(
             lambda connection: connection.execute(query).scalar_one()
         )
-
-    def _erase(self, row: Any, expired: sa.ColumnElement[bool], by: By) -> bool:
-        # The row, too: a tenant or a subject of the same name may have been made anew.
-        still_due = sa.and_(SubjectRow.id == row.id, expired)
-        try:
-            receipt = self._erasures.erase_if(row.tenant, row.subject_id, still_due, by=by)
-        except UnknownTenant:
-            return False
-        return receipt is not None
-
-
-def _due(
-    connection: Connection, *, expired: sa.ColumnElement[bool], after: Place | None, batch: int
-) -> Sequence[Any]:
-    query = (
-        sa.select(
-            SubjectRow.updated_at,
-            SubjectRow.id,
-            TenantRow.name.label("tenant"),
-            SubjectRow.subject_id,
-        )
-        .join(TenantRow, TenantRow.id == SubjectRow.tenant_id)
-        .where(expired)
-        .order_by(SubjectRow.updated_at, SubjectRow.id)
-        .limit(batch)
-    )
-    if after is not None:
-        updated_at, row_id = after
-        place = sa.tuple_(sa.literal(updated_at, UtcDateTime()), sa.literal(row_id))
-        query = query.where(sa.tuple_(SubjectRow.updated_at, SubjectRow.id) > place)
-    return connection.execute(query).all()

@@ -1,34 +1,23 @@
 """Master key rotation: wrap again whatever an older key wrapped.
 
 Only wrapped keys and secrets are touched, never a template: the work is a few hundred bytes a
-subject. It runs in small transactions beside a service in use. Each row is replaced only if it
-still holds the blob that was read, so an enrollment that happens meanwhile is never undone.
-
-Whatever is sealed under the master key is sealed inside the transaction that stores it. So after
-waiting for the writes that were under way when the key changed, none can still appear under the old
-key.
+subject. It runs in small writes beside a service in use. What a service seals meanwhile is sealed
+inside of a write, under the key that its key file has then: none appears under the old key later.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 from sqlalchemy.orm import InstrumentedAttribute
 
-from templates.keys.sealing import MasterKeyring, sealed_key_id
+from templates.keys.sealing import sealed_key_id
 from templates.store.context import StoreContext
-from templates.store.deployment import CHECK_PURPOSE, SECRET_PURPOSE
 from templates.store.envelope import DATA_KEY_PURPOSE
-from templates.store.schema import (
-    Base,
-    MasterKeyCheckRow,
-    RotationKeyRow,
-    SecretRow,
-    SubjectRow,
-)
+from templates.store.schema import Base, RotationKeyRow, SecretRow, SubjectRow
+from templates.store.secrets import SECRET_PURPOSE
 from templates.store.tenants import ROTATION_PURPOSE
 
 Attribute = InstrumentedAttribute[Any]
@@ -36,7 +25,7 @@ Attribute = InstrumentedAttribute[Any]
 
 @dataclass(frozen=True)
 class WrappedColumn:
-    """A column of blobs under the master key, and what each blob is bound to."""
+    """A column of blobs under the master key, the key of its table, and what blobs are bound to."""
 
     table: type[Base]
     blob: Attribute
@@ -46,7 +35,7 @@ class WrappedColumn:
     bound_to: Sequence[Attribute]
 
 
-# The mark of the master key is last: it says that everything before it is done.
+# The secrets are last: a keyring that opens them opens everything before them.
 WRAPPED_COLUMNS = (
     WrappedColumn(
         SubjectRow,
@@ -72,14 +61,6 @@ WRAPPED_COLUMNS = (
         SECRET_PURPOSE,
         [SecretRow.name],
     ),
-    WrappedColumn(
-        MasterKeyCheckRow,
-        MasterKeyCheckRow.wrapped_value,
-        MasterKeyCheckRow.wrapping_key,
-        [MasterKeyCheckRow.id],
-        CHECK_PURPOSE,
-        [],
-    ),
 )
 
 
@@ -97,27 +78,26 @@ class WrappedKeys:
         batch
             Rows in one transaction.
         progress
-            Called after each transaction with the number of rows it re-wrapped.
+            Called after each transaction with the number of rows it wrapped again.
 
         Raises
         ------
         SealError
-            If a blob is under a key that the keyring lacks. What was re-wrapped before it stays so,
-            and the next run goes on from there.
-        StoreUnavailable
-            If a write that was under way at the start does not end within the timeout.
+            If a blob is under a key that the keyring lacks. What was wrapped again before it stays
+            so, and the next run goes on from there.
         """
-        database, keyring, total = self._context.database, self._context.keyring, 0
-        current = None
+        database, keyring, total, current = self._context.database, self._context.keyring, 0, None
         while keyring.current != current:  # again where the key file changed once more meanwhile
             current = keyring.current
-            database.await_writers()
             for column in WRAPPED_COLUMNS:
-                work = partial(_rewrap_batch, column=column, keyring=keyring, batch=batch)
-                while any(counts := database.write(work)):
-                    total += counts.changed
+                while count := database.write(
+                    lambda connection, column=column: self._rewrap(  # type: ignore[misc]
+                        connection, column, batch
+                    )
+                ):
+                    total += count
                     if progress is not None:
-                        progress(counts.changed)
+                        progress(count)
         database.purge_log()
         return total
 
@@ -135,30 +115,22 @@ class WrappedKeys:
 
         return self._context.database.read(work)
 
-
-class _Counts(NamedTuple):
-    selected: int  # rows under another key
-    changed: int  # fewer, where somebody else wrote the row meanwhile
-
-
-def _rewrap_batch(
-    connection: Connection, *, column: WrappedColumn, keyring: MasterKeyring, batch: int
-) -> _Counts:
-    rows = connection.execute(
-        sa.select(column.blob.label("blob"), *dict.fromkeys((*column.key, *column.bound_to)))
-        .where(column.wrapping_key != keyring.current)
-        .order_by(*column.key)
-        .limit(batch)
-    ).all()
-    changed = 0
-    for row in rows:
-        bound_to = [row._mapping[part.key] for part in column.bound_to]
-        new = keyring.rewrap(row.blob, purpose=column.purpose, bound_to=bound_to)
-        unchanged = (part == row._mapping[part.key] for part in column.key)
-        result = connection.execute(
-            sa.update(column.table)
-            .where(column.blob == row.blob, *unchanged)
-            .values({column.blob: new, column.wrapping_key: sealed_key_id(new)})
-        )
-        changed += result.rowcount
-    return _Counts(selected=len(rows), changed=changed)
+    def _rewrap(self, connection: Connection, column: WrappedColumn, batch: int) -> int:
+        keyring = self._context.keyring
+        columns = dict.fromkeys((*column.key, *column.bound_to))
+        rows = connection.execute(
+            sa.select(column.blob.label("blob"), *columns)
+            .where(column.wrapping_key != keyring.current)
+            .order_by(*column.key)
+            .limit(batch)
+        ).all()
+        for row in rows:
+            bound_to = [row._mapping[part.key] for part in column.bound_to]
+            new = keyring.rewrap(row.blob, purpose=column.purpose, bound_to=bound_to)
+            is_row = (part == row._mapping[part.key] for part in column.key)
+            connection.execute(
+                sa.update(column.table)
+                .where(*is_row)
+                .values({column.blob: new, column.wrapping_key: sealed_key_id(new)})
+            )
+        return len(rows)

@@ -1,20 +1,13 @@
 """The tables of the store.
 
-Whatever is a secret is a sealed blob, and beside each blob that a master key sealed stands the id
-of that key (``wrapping_key``), so that a rotation finds the rows it still has to re-wrap. Rows
-that must outlive a subject (receipts, audit lines) name it by a keyed pseudonym only.
-
-A row that decides something carries ``mac``, and where the audit log tells of its changes ``line``,
-the number of the last line about it; see ``templates.store.authenticity``.
-
-What is not drawn here: triggers that refuse to change or remove a line of ``audit_log``
-(migration 0002). A migration that rebuilds that table on SQLite has to make them again.
+A secret is stored sealed, and beside each blob that a master key sealed stands the id of that key
+(``wrapping_key``), so that a rotation of the master key finds the rows that it has to wrap again.
+Receipts and audit lines outlive a subject: they name it by a keyed pseudonym only.
 """
 
 from datetime import UTC, datetime
 
 from sqlalchemy import (
-    JSON,
     BigInteger,
     Boolean,
     DateTime,
@@ -29,23 +22,8 @@ from sqlalchemy import (
     TypeDecorator,
     UniqueConstraint,
     false,
-    text,
-    true,
 )
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
-
-# Which lines of the audit log a record is held against; each list has its index, and what is asked
-# with the same words uses it. The lines of a key name it in their detail.
-KEY_LINES = text("action IN ('key-create', 'key-replace', 'key-revoke')")
-TENANT_LINES = text(
-    "action IN ('tenant-settings', 'tenant-rotate', 'tenant-erase') "
-    "AND outcome NOT IN ('moved', 'retired', 'resumed', 'receipt_repeated')"
-)
-ATTEMPT_LINES = text(
-    "action IN ('verify', 'lockout-reset', 'erase') AND "
-    "outcome IN ('accept', 'reject', 'reset', 'erased', 'nothing_held', 'receipt_repeated')"
-)
-NONCE_LINES = text("nonce IS NOT NULL")
 
 KEY_ID = String(16)
 PSEUDONYM = String(64)
@@ -109,20 +87,6 @@ class TenantRow(Base):
     rotation_epoch: Mapped[int] = mapped_column(Integer)
     created_at: Mapped[datetime] = mapped_column(UtcDateTime)
     template_enrollment: Mapped[bool] = mapped_column(Boolean, server_default=false())
-    line: Mapped[int] = mapped_column(SERIAL, server_default="0")
-    mac: Mapped[bytes | None] = mapped_column(MAC)
-
-
-class TenantErasureRow(Base):
-    """A tenant that is being erased: how many records of each kind are gone so far."""
-
-    __tablename__ = "tenant_erasures"
-
-    tenant_id: Mapped[str] = mapped_column(
-        UUID_HEX, ForeignKey("tenants.id", ondelete="CASCADE"), primary_key=True
-    )
-    begun_at: Mapped[datetime] = mapped_column(UtcDateTime)
-    removed: Mapped[dict[str, int]] = mapped_column(JSON)
 
 
 class RotationKeyRow(Base):
@@ -140,7 +104,7 @@ class RotationKeyRow(Base):
 
 
 class ApiKeyRow(Base):
-    """An API key, as the hash of its token."""
+    """An API key: the hash of its token, and a MAC of everything that gives rights."""
 
     __tablename__ = "api_keys"
 
@@ -157,8 +121,7 @@ class ApiKeyRow(Base):
     revoked_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
     last_used_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
     lowest_level: Mapped[str | None] = mapped_column(String(64))
-    line: Mapped[int] = mapped_column(SERIAL, server_default="0")
-    mac: Mapped[bytes | None] = mapped_column(MAC)
+    mac: Mapped[bytes] = mapped_column(MAC)
 
 
 class SubjectRow(Base):
@@ -168,7 +131,7 @@ class SubjectRow(Base):
     __table_args__ = (
         UniqueConstraint("tenant_id", "subject_id"),
         Index("ix_subjects_wrapping_key", "wrapping_key"),
-        Index("ix_subjects_updated_at_id", "updated_at", "id"),
+        Index("ix_subjects_updated_at", "updated_at"),
     )
 
     id: Mapped[str] = mapped_column(UUID_HEX, primary_key=True)
@@ -206,10 +169,7 @@ class TemplateRow(Base):
 
 
 class FailedAttemptsRow(Base):
-    """Failed verifications of a subject, enrolled or not, and until when it is locked.
-
-    `known` says whether it was enrolled at the last one.
-    """
+    """Failed verifications of a subject, enrolled or not, and until when it is locked."""
 
     __tablename__ = "failed_attempts"
 
@@ -219,24 +179,9 @@ class FailedAttemptsRow(Base):
     pseudonym: Mapped[str] = mapped_column(PSEUDONYM, primary_key=True)
     consecutive: Mapped[int] = mapped_column(Integer)
     total: Mapped[int] = mapped_column(Integer)
-    last_failed_at: Mapped[datetime] = mapped_column(UtcDateTime)
+    last_failed_at: Mapped[datetime] = mapped_column(UtcDateTime, index=True)
     locked_until: Mapped[datetime | None] = mapped_column(UtcDateTime)
     disabled_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
-    known: Mapped[bool] = mapped_column(Boolean, server_default=true())
-    line: Mapped[int] = mapped_column(SERIAL, server_default="0")
-    mac: Mapped[bytes | None] = mapped_column(MAC)
-
-
-class UsedNonceRow(Base):
-    """A nonce of a challenge or a token, kept until its time alone would refuse it."""
-
-    __tablename__ = "used_nonces"
-
-    api_key_id: Mapped[str] = mapped_column(
-        UUID_HEX, ForeignKey("api_keys.id", ondelete="CASCADE"), primary_key=True
-    )
-    nonce_hash: Mapped[bytes] = mapped_column(LargeBinary(32), primary_key=True)
-    expires_at: Mapped[datetime] = mapped_column(UtcDateTime, index=True)
 
 
 class ReceiptRow(Base):
@@ -253,49 +198,46 @@ class ReceiptRow(Base):
 
 
 class AuditRow(Base):
-    """One line of the audit log, chained to the one before by its hash."""
+    """One line of the audit log; its MAC covers the MAC of the line before.
+
+    `at` is ISO 8601 text in UTC with microseconds, as the MAC covers it. `token` is the digest of
+    the one-use token or challenge that the line used up: the database takes each one once.
+    """
 
     __tablename__ = "audit_log"
     __table_args__ = (
-        *(
-            Index(name, column, "sequence", sqlite_where=which, postgresql_where=which)
-            for name, column, which in (
-                ("ix_audit_log_key_lines", "detail", KEY_LINES),
-                ("ix_audit_log_tenant_lines", "tenant", TENANT_LINES),
-                ("ix_audit_log_attempt_lines", "pseudonym", ATTEMPT_LINES),
-            )
-        ),
-        Index(
-            "ix_audit_log_nonce", "nonce", sqlite_where=NONCE_LINES, postgresql_where=NONCE_LINES
-        ),
+        Index("ix_audit_log_tenant_sequence", "tenant", "sequence"),
+        Index("ix_audit_log_pseudonym_sequence", "pseudonym", "sequence"),
     )
 
     sequence: Mapped[int] = mapped_column(SERIAL, primary_key=True, autoincrement=False)
-    at: Mapped[datetime] = mapped_column(UtcDateTime)
+    at: Mapped[str] = mapped_column(String(32))
     tenant: Mapped[str | None] = mapped_column(String(64))
-    actor: Mapped[str | None] = mapped_column(String(64))
+    actor: Mapped[str] = mapped_column(String(64))
     action: Mapped[str] = mapped_column(String(64))
     pseudonym: Mapped[str | None] = mapped_column(PSEUDONYM)
     outcome: Mapped[str] = mapped_column(String(64))
     request_id: Mapped[str | None] = mapped_column(String(64))
     detail: Mapped[str | None] = mapped_column(String(64))
-    previous_hash: Mapped[bytes] = mapped_column(LargeBinary(32))
-    hash: Mapped[bytes] = mapped_column(LargeBinary(32))
-    nonce: Mapped[str | None] = mapped_column(String(64))
+    token: Mapped[str | None] = mapped_column(String(64), unique=True)
+    mac: Mapped[bytes] = mapped_column(MAC)
 
 
 class AuditHeadRow(Base):
-    """One row: number and hash of the audit log's last line, and a MAC of both.
+    """One row: where the chain of the audit log begins and ends, under a MAC.
 
-    A line is added under the lock of this row.
+    The chain begins after line `base_sequence`, whose MAC was `base_mac`: 0 and zeros, until older
+    lines were archived. It ends with line `sequence`, whose MAC is `line_mac`.
     """
 
     __tablename__ = "audit_head"
 
     id: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=False)
+    base_sequence: Mapped[int] = mapped_column(SERIAL)
+    base_mac: Mapped[bytes] = mapped_column(MAC)
     sequence: Mapped[int] = mapped_column(SERIAL)
-    hash: Mapped[bytes] = mapped_column(LargeBinary(32))
-    mac: Mapped[bytes] = mapped_column(LargeBinary(32))
+    line_mac: Mapped[bytes] = mapped_column(MAC)
+    mac: Mapped[bytes] = mapped_column(MAC)
 
 
 class SecretRow(Base):
@@ -304,17 +246,6 @@ class SecretRow(Base):
     __tablename__ = "secrets"
 
     name: Mapped[str] = mapped_column(String(64), primary_key=True)
-    wrapped_value: Mapped[bytes] = mapped_column(LargeBinary)
-    wrapping_key: Mapped[str] = mapped_column(KEY_ID)
-    created_at: Mapped[datetime] = mapped_column(UtcDateTime)
-
-
-class MasterKeyCheckRow(Base):
-    """One row, sealed under the master key: a start with another key file fails on it."""
-
-    __tablename__ = "master_key_check"
-
-    id: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=False)
     wrapped_value: Mapped[bytes] = mapped_column(LargeBinary)
     wrapping_key: Mapped[str] = mapped_column(KEY_ID)
     created_at: Mapped[datetime] = mapped_column(UtcDateTime)

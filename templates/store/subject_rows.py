@@ -10,7 +10,6 @@ from sqlalchemy.engine import Connection
 
 from templates.keys.sealing import MasterKeyring
 from templates.store.envelope import Envelope, Owner, open_envelope
-from templates.store.identifiers import UnknownTenant
 from templates.store.schema import SubjectRow, TemplateRow, TenantRow
 
 
@@ -60,19 +59,9 @@ class SubjectTemplate:
         return self.record.holder_salt
 
 
-RECORD_COLUMNS = (
-    SubjectRow.subject_id,
-    TemplateRow.template_id,
-    TemplateRow.contract_id,
-    TemplateRow.rotation_epoch,
-    TemplateRow.n,
-    TemplateRow.m,
-    TemplateRow.dtype,
-    TemplateRow.source,
-    TemplateRow.photos,
-    TemplateRow.holder_salt,
-    SubjectRow.created_at,
-    SubjectRow.updated_at,
+RECORD_COLUMNS = tuple(
+    getattr(SubjectRow if name in ("subject_id", "created_at", "updated_at") else TemplateRow, name)
+    for name in SubjectRecord.__dataclass_fields__
 )
 """What :func:`read_record` needs."""
 TEMPLATE_COLUMNS = (
@@ -85,10 +74,11 @@ TEMPLATE_COLUMNS = (
 """What the functions below need."""
 
 
-def of_tenant(columns: tuple[Any, ...], tenant: str) -> Any:
+def select_subjects(columns: tuple[Any, ...], tenant: str) -> Any:
     """Select columns of the subjects of a tenant, each with its template."""
     return (
         sa.select(*columns)
+        .select_from(SubjectRow)
         .join(TemplateRow, TemplateRow.subject_pk == SubjectRow.id)
         .join(TenantRow, TenantRow.id == SubjectRow.tenant_id)
         .where(TenantRow.name == tenant)
@@ -106,11 +96,6 @@ def owner_of(row: Any) -> Owner:
     return Owner(**{name: row._mapping[name] for name in Owner.__dataclass_fields__})
 
 
-def envelope_of(row: Any) -> Envelope:
-    """The stored template of a row."""
-    return Envelope(row.wrapped_key, row.ciphertext)
-
-
 def opened_template(row: Any, keyring: MasterKeyring) -> SubjectTemplate:
     """Decrypt the template of a row.
 
@@ -119,17 +104,8 @@ def opened_template(row: Any, keyring: MasterKeyring) -> SubjectTemplate:
     SealError
         If the row was altered or moved, or its master key is missing.
     """
-    wire = open_envelope(envelope_of(row), owner_of(row), keyring)
+    wire = open_envelope(Envelope(row.wrapped_key, row.ciphertext), owner_of(row), keyring)
     return SubjectTemplate(record=read_record(row), wire=wire)
-
-
-def tenant_id_of(connection: Connection, name: str) -> str:
-    """Row id of a tenant, or :class:`UnknownTenant`."""
-    query = sa.select(TenantRow.id).where(TenantRow.name == name)
-    tenant_id = connection.execute(query).scalar_one_or_none()
-    if tenant_id is None:
-        raise UnknownTenant.named(name)
-    return tenant_id
 
 
 def subject_pk_of(connection: Connection, tenant_id: str, subject_id: str) -> str | None:
@@ -139,8 +115,3 @@ def subject_pk_of(connection: Connection, tenant_id: str, subject_id: str) -> st
             SubjectRow.tenant_id == tenant_id, SubjectRow.subject_id == subject_id
         )
     ).scalar_one_or_none()
-
-
-def subject_lock(tenant: str, subject_id: str) -> str:
-    """Name of the lock under which a subject is written."""
-    return f"subject {tenant} {subject_id}"

@@ -10,32 +10,30 @@ from sqlalchemy.engine import Connection
 
 from templates.errors import StoreBusy, StoreError
 from templates.keys.sealing import sealed_key_id
-from templates.store.audit_log import PROGRAM, By, Entry
+from templates.store.audit_log import PROGRAM, By, Entry, is_used
 from templates.store.context import StoreContext
 from templates.store.cursors import close_cursor, open_cursor
-from templates.store.envelope import Owner, close_envelope
+from templates.store.envelope import Envelope, Owner, close_envelope
 from templates.store.identifiers import (
     InvalidIdentifier,
-    UnknownTenant,
     checked_opaque_id,
     checked_subject_id,
     checked_subject_prefix,
 )
-from templates.store.lockout import Nonce
-from templates.store.nonces import Nonces
-from templates.store.schema import FailedAttemptsRow, SubjectRow, TemplateRow, TenantRow
+from templates.store.lockout import Replayed
+from templates.store.schema import SubjectRow, TemplateRow
 from templates.store.subject_rows import (
     RECORD_COLUMNS,
     TEMPLATE_COLUMNS,
     Source,
     SubjectRecord,
     SubjectTemplate,
-    of_tenant,
     opened_template,
     read_record,
-    subject_lock,
+    select_subjects,
     subject_pk_of,
 )
+from templates.store.tenants import tenant_of
 
 MAX_WIRE_BYTES = 4 * 1024 * 1024  # a float32 template of n = 4096, m = 192 has 3.2 MB
 MAX_PAGE = 1000
@@ -91,9 +89,8 @@ class SubjectPage:
 class Subjects:
     """Repository of subjects."""
 
-    def __init__(self, context: StoreContext, nonces: Nonces) -> None:
+    def __init__(self, context: StoreContext) -> None:
         self._context = context
-        self._nonces = nonces
 
     def put(
         self,
@@ -112,7 +109,7 @@ class Subjects:
         rotation_epoch: int | None = None,
         precondition: Precondition | None = None,
         action: Literal["enroll", "import"] = "enroll",
-        nonce: Nonce | None = None,
+        token: str | None = None,
         by: By = PROGRAM,
     ) -> StoredTemplate:
         """Store a template, or replace the one there is, in one transaction.
@@ -136,8 +133,9 @@ class Subjects:
             What may be replaced; whatever there is by default.
         action
             What the line of the audit log calls it.
-        nonce
-            Of the token that allows the enrollment, which uses it up; None where none is needed.
+        token
+            Digest of the one-use token that allows the enrollment, which uses it up; None where
+            none is needed.
         by
             Who enrolls, for the audit log.
 
@@ -147,7 +145,7 @@ class Subjects:
         EnrollmentConflict
             If the subject does not meet the precondition.
         Replayed
-            If the nonce was used before.
+            If the token was used before.
 
         Notes
         -----
@@ -162,53 +160,41 @@ class Subjects:
                 f"a template has 1 to {MAX_WIRE_BYTES} wire bytes, this has {len(wire)}"
             )
         context = self._context
+        pseudonym = context.signer.pseudonym(tenant, subject_id)
 
         def work(connection: Connection) -> StoredTemplate:
-            pseudonym = context.signer.pseudonym(tenant, subject_id)
-            owner_row = connection.execute(_TENANT.where(TenantRow.name == tenant)).one_or_none()
-            if owner_row is None:
-                raise UnknownTenant.named(tenant)
-            tenant_id, current_epoch = owner_row.id, owner_row.rotation_epoch
-            epoch = current_epoch if rotation_epoch is None else rotation_epoch
-            if epoch != current_epoch:
+            owner_tenant = tenant_of(connection, tenant)
+            epoch = owner_tenant.rotation_epoch
+            if rotation_epoch not in (None, epoch):
                 raise StoreBusy("the tenant's rotation was renewed meanwhile; send it again")
-            enrolled_pk = subject_pk_of(connection, tenant_id, subject_id)
+            enrolled_pk = subject_pk_of(connection, owner_tenant.id, subject_id)
             if precondition is not None:
                 enrolled = connection.execute(_TEMPLATE_ID, {"pk": enrolled_pk}).scalar()
                 if enrolled != precondition.template_id:
                     raise EnrollmentConflict(enrolled)
-            nonce_digest = None if nonce is None else self._nonces.use(connection, nonce)
-            now = context.clock()
+            if token is not None and is_used(connection, token):
+                raise Replayed
             is_new, subject_pk = enrolled_pk is None, enrolled_pk or uuid.uuid4().hex
             owner = Owner(
-                tenant_id, subject_pk, subject_id, contract_id, template_id, epoch, holder_salt
+                owner_tenant.id,
+                subject_pk,
+                subject_id,
+                contract_id,
+                template_id,
+                epoch,
+                holder_salt,
             )
+            # Sealed here: a rotation of the master key that ends later finds it.
             envelope = close_envelope(wire, owner, context.keyring)
-            metadata = {
-                "n": n,
-                "m": m,
-                "dtype": dtype,
-                "source": Source(source).value,
-                "photos": photos,
-                "ciphertext": envelope.ciphertext,
-            }
-            _write_rows(connection, owner, envelope.wrapped_key, metadata, is_new=is_new, now=now)
-            if is_new:
-                # A count of failures from before goes when the subject goes, and not earlier.
-                connection.execute(
-                    sa.update(FailedAttemptsRow)
-                    .where(
-                        FailedAttemptsRow.tenant_id == tenant_id,
-                        FailedAttemptsRow.pseudonym == pseudonym,
-                    )
-                    .values(known=True)
-                )
+            metadata = {"n": n, "m": m, "dtype": dtype, "source": Source(source), "photos": photos}
+            now = context.clock()
+            _write_rows(connection, owner, envelope, metadata, is_new=is_new, now=now)
             outcome = "created" if is_new else "replaced"
-            entry = Entry(action, outcome, by, tenant, pseudonym, nonce=nonce_digest)
+            entry = Entry(action, outcome, by, tenant, pseudonym, token=token)
             context.audit_log.append(connection, entry)
             return StoredTemplate(template_id, is_new)
 
-        stored = context.write(work, lock=subject_lock(tenant, subject_id))
+        stored = context.database.write(work)
         if not stored.created:
             context.database.purge_log()
         return stored
@@ -222,15 +208,17 @@ class Subjects:
             If the subject was enrolled again, or erased, since the template was read.
         """
         context = self._context
+        query = select_subjects((TemplateRow.template_id,), tenant).where(
+            SubjectRow.subject_id == checked_subject_id(subject_id)
+        )
+        pseudonym = context.signer.pseudonym(tenant, subject_id)
 
         def work(connection: Connection) -> None:
-            if connection.execute(_EXPORTED, subject).scalar_one_or_none() != template_id:
+            if connection.execute(query).scalar_one_or_none() != template_id:
                 raise StoreBusy("the subject was enrolled again or erased meanwhile: send it again")
-            pseudonym = context.signer.pseudonym(tenant, subject_id)
             context.audit_log.append(connection, Entry("export", "exported", by, tenant, pseudonym))
 
-        subject = {"tenant": tenant, "subject_id": checked_subject_id(subject_id)}
-        context.write(work, lock=subject_lock(tenant, subject_id))
+        context.database.write(work)
 
     def get(self, tenant: str, subject_id: str) -> SubjectTemplate | None:
         """Return a subject with its decrypted template, or None.
@@ -250,7 +238,7 @@ class Subjects:
 
     def _row(self, columns: tuple[Any, ...], tenant: str, subject_id: str) -> Any:
         subject = SubjectRow.subject_id == checked_subject_id(subject_id)
-        query = of_tenant(columns, tenant).where(subject)
+        query = select_subjects(columns, tenant).where(subject)
         return self._context.database.read(
             lambda connection: connection.execute(query).one_or_none()
         )
@@ -282,7 +270,9 @@ class Subjects:
         """
         if not 1 <= limit <= MAX_PAGE:
             raise InvalidIdentifier(f"the limit of a page is 1 to {MAX_PAGE}")
-        query = of_tenant(RECORD_COLUMNS, tenant).order_by(SubjectRow.subject_id).limit(limit + 1)
+        query = (
+            select_subjects(RECORD_COLUMNS, tenant).order_by(SubjectRow.subject_id).limit(limit + 1)
+        )
         keyring = self._context.keyring
         if cursor is not None:
             after = open_cursor(keyring, cursor, purpose=_CURSOR_PURPOSE, tenant=tenant)
@@ -301,16 +291,6 @@ class Subjects:
         )
 
 
-_TENANT = sa.select(TenantRow.id, TenantRow.rotation_epoch)
-_EXPORTED: Any = (
-    sa.select(TemplateRow.template_id)
-    .join(SubjectRow, SubjectRow.id == TemplateRow.subject_pk)
-    .join(TenantRow, TenantRow.id == SubjectRow.tenant_id)
-    .where(
-        TenantRow.name == sa.bindparam("tenant"),
-        SubjectRow.subject_id == sa.bindparam("subject_id"),
-    )
-)
 _TEMPLATE_ID = sa.select(TemplateRow.template_id).where(
     TemplateRow.subject_pk == sa.bindparam("pk")
 )
@@ -319,7 +299,7 @@ _TEMPLATE_ID = sa.select(TemplateRow.template_id).where(
 def _write_rows(
     connection: Connection,
     owner: Owner,
-    wrapped_key: bytes,
+    envelope: Envelope,
     metadata: dict[str, Any],
     *,
     is_new: bool,
@@ -327,8 +307,8 @@ def _write_rows(
 ) -> None:
     """Insert a subject and its template, or replace the template and the data key there are."""
     key_columns = {
-        "wrapped_key": wrapped_key,
-        "wrapping_key": sealed_key_id(wrapped_key),
+        "wrapped_key": envelope.wrapped_key,
+        "wrapping_key": sealed_key_id(envelope.wrapped_key),
         "updated_at": now,
     }
     if is_new:
@@ -350,6 +330,7 @@ def _write_rows(
             contract_id=owner.contract_id,
             rotation_epoch=owner.rotation_epoch,
             holder_salt=owner.holder_salt,
+            ciphertext=envelope.ciphertext,
             created_at=now,
             **metadata,
         )

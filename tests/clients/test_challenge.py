@@ -33,7 +33,7 @@ def test_a_challenge_is_answered_once(asking: Running) -> None:
         decision = client.verify("anna", frames, challenge=challenge)
         assert decision
         assert (decision.liveness, decision.liveness_failure) == ("passed", None)
-        with pytest.raises(Unauthorized, match="seen before"):
+        with pytest.raises(Unauthorized, match="used before"):
             client.verify("anna", frames, challenge=challenge)
         still = client.verify("anna", [frame()] * 5, challenge=client.challenge())
         assert not still

@@ -16,7 +16,7 @@ def test_a_token_is_used_once_and_its_outcome_is_told(service: Running) -> None:
         writing = server.create_token("tina", "enroll")
         with Client(service.url, writing.token) as page:
             assert not page.enroll("tina", photo(1)).replaced
-            with pytest.raises(Unauthorized, match="seen before"):
+            with pytest.raises(Unauthorized, match="used before"):
                 page.enroll("tina", photo(2))
         assert server.token_outcome("tina", writing.token_id).outcome == "created"
         late = server.create_token("tina", "enroll", replace=False)
@@ -31,7 +31,7 @@ def test_a_token_is_used_once_and_its_outcome_is_told(service: Running) -> None:
                     page.verify("tom", photo(person, 3))
                 decision = page.verify("tina", photo(person, 3))
                 assert bool(decision) is (person == 1)
-                with pytest.raises(Unauthorized, match="seen before"):
+                with pytest.raises(Unauthorized, match="used before"):
                     page.verify("tina", photo(person, 3))
             outcome = server.token_outcome("tina", issued.token_id)
             assert (bool(outcome), outcome.level) == (person == 1, "fmr-1e-3")

@@ -8,26 +8,23 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from datetime import timedelta
 from typing import Any, Protocol
 
 import sqlalchemy as sa
 
-from api.http.tokens import LONGEST_S
 from api.process.runtime import open_keyring, open_store
 from templates.contract import wire
 from templates.errors import VeilfaceError
 from templates.store import TemplateStore
-from templates.store.audit_chain import Line
+from templates.store.audit_log import Line
 from templates.store.receipts import Receipt, verify_receipt
-from templates.store.schema import ReceiptRow, SubjectRow, TemplateRow, UsedNonceRow
+from templates.store.schema import ReceiptRow, SubjectRow, TemplateRow
 from tests.api.deployment import Deployment, M, N
 from tests.reliability.linearizability import SearchTooLong
 from tests.reliability.operations import Operation
 from tests.reliability.register import call_of, explain
 
 DECIDED = ("accept", "reject")
-SURELY_KEPT = timedelta(seconds=LONGEST_S / 2)
 ENROLLED = {True: "replaced", False: "created"}
 
 
@@ -102,7 +99,7 @@ class _Examination:
             self._lines_follow_the_clock,
             self._tables_are_whole,
             self._receipts,
-            self._nonces,
+            self._tokens,
             self._repeated_probes,
         ):
             check()
@@ -118,9 +115,12 @@ class _Examination:
         self.violations.append(what)
 
     def _chain(self) -> None:
-        verification = self.store.audit_log.verify()
-        for problem in verification.problems:
+        verification, records = self.store.verify_audit_log()
+        if verification.problem is not None:
+            problem = verification.problem
             self._wrong(f"audit log: line {problem.sequence}: {problem.what}")
+        for record in records:
+            self._wrong(f"audit log: {record.about}: {record.what}")
 
     def _answers_have_their_lines(self) -> None:
         for each in self.history:
@@ -191,20 +191,14 @@ class _Examination:
         if written != Counter(row.pseudonym for row in rows):
             self._wrong("receipts: not one for each erasure of the audit log")
 
-    def _nonces(self) -> None:
+    def _tokens(self) -> None:
         """Every decision has used up a token of its own, and nothing else has."""
         decided = [
             line for line in self.lines if line.action == "verify" and line.outcome in DECIDED
         ]
-        digests = {line.nonce for line in decided} - {None}
-        used = self._scalar(sa.select(sa.func.count()).select_from(UsedNonceRow))
-        # Rows of tokens that have expired are removed at every start.
-        recent = sum(line.at > self.lines[-1].at - SURELY_KEPT for line in decided)
-        if len(digests) != len(decided) or not recent <= used <= len(decided):
-            self._wrong(
-                f"nonces: {len(decided)} decisions, of which {recent} are recent, have "
-                f"{len(digests)} digests and {used} rows"
-            )
+        tokens = [line.token for line in self.lines if line.token is not None]
+        if tokens != [line.token for line in decided] or len(set(tokens)) != len(tokens):
+            self._wrong(f"tokens: {len(decided)} decisions used up {len(set(tokens))}")
 
     def _repeated_probes(self) -> None:
         """A token that was decided on is refused when it is sent again, and only such a one."""

@@ -167,9 +167,12 @@ def loses_the_receipts(stopped: StoppedDeployment) -> None:
     stopped.execute("DELETE FROM receipts")
 
 
-def forgets_a_nonce(stopped: StoppedDeployment) -> None:
-    stopped.execute("DELETE FROM used_nonces WHERE nonce_hash IN "
-                    "(SELECT nonce_hash FROM used_nonces LIMIT 1)")  # fmt: skip
+def forgets_a_token(stopped: StoppedDeployment) -> None:
+    stopped.execute("UPDATE audit_log SET token = NULL WHERE outcome = 'reject'")
+
+
+def lowers_a_count(stopped: StoppedDeployment) -> None:
+    stopped.execute("UPDATE failed_attempts SET consecutive = 0, total = 0")
 
 
 def counts_wrongly(stopped: StoppedDeployment) -> None:
@@ -177,13 +180,7 @@ def counts_wrongly(stopped: StoppedDeployment) -> None:
 
 
 def alters_a_line(stopped: StoppedDeployment) -> None:
-    triggers = sa.text("SELECT name FROM sqlite_master WHERE type = 'trigger'")
-    with stopped.store() as store:
-        named = store.database.read(lambda each: each.execute(triggers).scalars().all())
-    stopped.execute(
-        *(f"DROP TRIGGER {name}" for name in named),
-        "UPDATE audit_log SET outcome = 'accept' WHERE outcome = 'reject'",
-    )
+    stopped.execute("UPDATE audit_log SET outcome = 'accept' WHERE outcome = 'reject'")
 
 
 def answered_without_a_line(stopped: StoppedDeployment) -> None:
@@ -248,7 +245,8 @@ def decided_twice(stopped: StoppedDeployment) -> None:
         (spoils_the_template, "its template cannot be opened"),
         (has_another_template, "another template than"),
         (loses_the_receipts, "receipts: none for erase"),
-        (forgets_a_nonce, "nonces: "),
+        (forgets_a_token, "tokens: "),
+        (lowers_a_count, "was lowered"),
         (counts_wrongly, "failed attempts are"),
         (alters_a_line, ": altered"),
         (answered_without_a_line, "audit log: 0 lines"),

@@ -24,7 +24,7 @@ from tests.verify.synthetic import (
     tenant_rotation,
     unit,
 )
-from verify import Calibrated, Decision, StandIn, Verifier, lift_stand_in
+from verify import Calibrated, Decision, StandIn, Verifier
 
 KEY, OTHER = bytes(range(32)), bytes(range(1, 33))
 HOLDER = Holder(KEY, "default", "ada")
@@ -211,7 +211,7 @@ def test_the_holders_rotation_is_derived_and_applied_always(
 
     monkeypatch.setattr(verify.verifier, "holder_rotation", counted)
     probe = lifted_by_a_client(contract, PEOPLE[0], 2)
-    nobody = StandIn(keyed.wire, lift_stand_in(contract.nobody(make_generator()), bytes(32)))
+    nobody = StandIn(keyed.wire)
     answers: set[tuple[bool, str]] = set()
 
     def note(decision: Decision) -> None:

@@ -9,9 +9,9 @@ from api.http.answers import answer
 from api.http.auth import note_subject
 from api.http.deps import Administers, GateDep, Limit, RuntimeDep
 from api.http.openapi import EVERY_CALL, error_responses
-from api.http.schemas import AuditLine, AuditLogAnswer
+from api.http.schemas import AuditLogAnswer
 from api.http.values import iso_time
-from templates.store.audit_chain import Line
+from templates.store.audit_log import Line
 from templates.store.cursors import close_cursor, open_cursor
 from templates.store.identifiers import checked_subject_id
 
@@ -37,15 +37,14 @@ async def get_audit_log(
 ) -> Response:
     """Right: `admin`. The latest line first; subjects are named by their pseudonyms.
 
-    A line that was altered is told by its number alone. That lines were removed or moved takes the
-    whole log to see, and `veilface audit-log verify`. A page may be short, or empty, where other
-    tenants have most of the lines: only `next_cursor` says whether there are earlier ones.
+    Whether a line was altered, removed or moved takes the whole log to see, and
+    `veilface audit-log verify`.
     """
     store, tenant = runtime.store, caller.tenant
-    pseudonyms: tuple[str, ...] = ()
+    pseudonym = None
     if subject_id is not None:
-        pseudonyms = store.signer.pseudonyms(tenant, checked_subject_id(subject_id))
-        note_subject(request, pseudonyms[0])
+        pseudonym = store.signer.pseudonym(tenant, checked_subject_id(subject_id))
+        note_subject(request, pseudonym)
 
     def work() -> dict[str, Any]:
         before = None
@@ -53,10 +52,10 @@ async def get_audit_log(
             opened = open_cursor(runtime.keyring, cursor, purpose=_CURSOR_PURPOSE, tenant=tenant)
             before = int(opened)
         lines, earlier = store.audit_log.page(
-            tenant, limit=limit, before=before, pseudonyms=pseudonyms
+            tenant, limit=limit, before=before, pseudonym=pseudonym
         )
         return {
-            "lines": [_told(number, line) for number, line in lines],
+            "lines": [_answered(line) for line in lines],
             "next_cursor": None
             if earlier is None
             else close_cursor(
@@ -67,10 +66,8 @@ async def get_audit_log(
     return answer(request, await gate.query(work))
 
 
-def _told(number: int, line: Line | None) -> dict[str, Any]:
-    # Other numbers would tell how much the other tenants do.
-    if line is None:
-        return {**dict.fromkeys(AuditLine.model_fields), "altered": True, "sequence": number}
+def _answered(line: Line) -> dict[str, Any]:
+    # Without its number, which would tell how much the other tenants do.
     return {
         "at": iso_time(line.at),
         "actor": line.actor,
@@ -79,6 +76,4 @@ def _told(number: int, line: Line | None) -> dict[str, Any]:
         "outcome": line.outcome,
         "detail": line.detail,
         "request_id": line.request_id,
-        "altered": False,
-        "sequence": None,
     }

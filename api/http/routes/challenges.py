@@ -49,7 +49,7 @@ async def create_challenge(
         tenant=caller.tenant,
         key_prefix=caller.prefix,
         subject=subject,
-        token_nonce=None if token is None else token.nonce,
+        token=token,
     )
     return answer(
         request,

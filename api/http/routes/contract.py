@@ -4,13 +4,12 @@ from fastapi import APIRouter, Depends, Request
 from starlette.responses import Response
 
 from api.http.answers import answer, has_copy
-from api.http.audit_report import NOT_AUDITED, AuditReport, kind_of_decoys
-from api.http.auth import CallerDep, caller, holding
+from api.http.auth import CallerDep, holding
 from api.http.deps import GateDep, RuntimeDep
 from api.http.errors import ApiError
 from api.http.openapi import EVERY_CALL, error_responses
-from api.http.receipts import receipt_keys_json
-from api.http.schemas import AuditAnswer, ContractAnswer
+from api.http.receipts import receipt_key_json
+from api.http.schemas import ContractAnswer
 from templates.decoys import DecoyGenerator
 
 router = APIRouter(prefix="/v1/contract", tags=["contract"])
@@ -26,7 +25,6 @@ async def get_contract(
     request: Request, caller: CallerDep, runtime: RuntimeDep, gate: GateDep
 ) -> Response:
     """Any valid key may read it. What the contract seals is not part of it."""
-    keys = await gate.query(runtime.store.signer.keys)
     tenant = await gate.query(lambda: runtime.store.tenants.get(caller.tenant))
     return answer(
         request,
@@ -35,7 +33,7 @@ async def get_contract(
             "photos": runtime.pack is not None,
             "generator": isinstance(runtime.source, DecoyGenerator),
             "template_enrollment": tenant.template_enrollment,
-            "receipt_key": receipt_keys_json(keys),
+            "receipt_key": receipt_key_json(runtime.store.signer.public_key()),
         },
     )
 
@@ -79,18 +77,3 @@ async def get_generator(request: Request, runtime: RuntimeDep, gate: GateDep) ->
     return Response(
         await gate.query(source.to_bytes), media_type="application/octet-stream", headers=headers
     )
-
-
-@router.get(
-    "/audit",
-    dependencies=[Depends(caller)],
-    response_model=AuditAnswer,
-    responses=error_responses(*EVERY_CALL),
-    summary="What an audit found of templates like these",
-)
-async def get_audit(request: Request, runtime: RuntimeDep) -> Response:
-    """Any valid key may read it: the figures of the report that `audit_report_file` names."""
-    report: AuditReport | None = request.app.state.audit_report
-    if report is None:
-        return answer(request, NOT_AUDITED)
-    return answer(request, report.reduced(runtime.contract, kind_of_decoys(runtime.source)))

@@ -35,7 +35,6 @@ from enroll import Enrollment, Holder
 from models.quality import Quality
 from templates.decoys import Attributes
 from templates.store.audit_log import By
-from templates.store.lockout import Nonce
 from templates.store.subject_rows import Source
 from templates.store.subjects import Precondition
 
@@ -117,7 +116,7 @@ async def enroll(
         holder_key = holder_key_of(holder_key_header, body)
 
         def work() -> dict[str, Any]:
-            nonce = _unused_nonce(runtime, caller)
+            token = _unused_token(runtime, caller)
             epoch = runtime.epoch(caller.tenant)
             enrollment = runtime.enroller(caller.tenant, epoch).from_template(
                 template, holder=_holder(holder_key, caller, subject)
@@ -130,7 +129,7 @@ async def enroll(
                 enrollment,
                 Source.TEMPLATE,
                 precondition,
-                nonce,
+                token,
                 by(request),
             )
 
@@ -155,7 +154,7 @@ async def _enroll_photos(
     holder_key = holder_key_of(holder_key_header, form.fields)
 
     def work() -> dict[str, Any]:
-        nonce = _unused_nonce(runtime, caller)
+        token = _unused_token(runtime, caller)
         epoch = runtime.epoch(caller.tenant)
         enrollment = runtime.enroller(caller.tenant, epoch).from_photos(
             pack,
@@ -173,7 +172,7 @@ async def _enroll_photos(
             enrollment,
             Source.PHOTOS,
             precondition,
-            nonce,
+            token,
             by(request),
         )
 
@@ -215,8 +214,8 @@ def _holder(key: bytearray | None, caller: Caller, subject: str) -> Holder | Non
     return None if key is None else Holder(key, caller.tenant, subject)
 
 
-def _unused_nonce(runtime: Runtime, caller: Caller) -> Nonce | None:
-    """Return what the enrollment uses up; None where it came with an API key.
+def _unused_token(runtime: Runtime, caller: Caller) -> str | None:
+    """Return the digest of what the enrollment uses up; None where it came with an API key.
 
     Raises
     ------
@@ -227,9 +226,8 @@ def _unused_nonce(runtime: Runtime, caller: Caller) -> Nonce | None:
         return None
     # Once more: the body and the turn to compute may have taken a while.
     caller.subject_token.require_in_time()
-    nonce = caller.subject_token.nonce
-    runtime.store.nonces.require_unused(nonce)
-    return nonce
+    runtime.store.audit_log.require_unused(caller.subject_token.digest)
+    return caller.subject_token.digest
 
 
 def _quality(quality: object) -> dict[str, Any]:
@@ -244,7 +242,7 @@ def _stored(
     enrollment: Enrollment,
     source: Source,
     precondition: Precondition | None,
-    nonce: Nonce | None,
+    token: str | None,
     who: By,
 ) -> dict[str, Any]:
     stored = runtime.put(
@@ -255,7 +253,7 @@ def _stored(
         source=source,
         photos=enrollment.photos,
         precondition=precondition,
-        nonce=nonce,
+        token=token,
         by=who,
     )
     return {

@@ -1,6 +1,5 @@
 """Tokens for browsers: made for one call of one subject, and what came of them."""
 
-from datetime import UTC, datetime
 from typing import Annotated
 
 from fastapi import APIRouter, Path, Request
@@ -14,10 +13,10 @@ from api.http.deps import EnrollsOrVerifies, GateDep, RuntimeDep, SubjectDep
 from api.http.errors import ApiError
 from api.http.openapi import BODY, EVERY_CALL, TOKEN_BODY, error_responses
 from api.http.schemas import TokenAnswer, TokenOutcomeAnswer
-from api.http.tokens import ACTIONS, LONGEST_S, new_token, nonce_of
+from api.http.tokens import ACTIONS, LONGEST_S, new_token
 from api.http.values import iso_time
 from api.process.metrics import TOKENS
-from templates.store.audit_log import Entry
+from templates.store.audit_log import Entry, token_digest
 from templates.store.identifiers import checked_subject_id
 
 FIELDS = ("subject_id", "action", "level", "lifetime_s", "replace")
@@ -125,11 +124,10 @@ async def get_token_outcome(
     For a token that another key asked for, of another subject, or that nobody asked for, it
     answers what it answers for one that was not used.
     """
-    pseudonyms = runtime.store.signer.pseudonyms(caller.tenant, subject)
-    # When it ends does not tell one from another.
-    nonce = nonce_of(caller.prefix, token_id, datetime.now(UTC))
-    line = await gate.query(lambda: runtime.store.nonces.line(nonce))
-    if line is None or line.pseudonym not in pseudonyms:
+    pseudonym = runtime.store.signer.pseudonym(caller.tenant, subject)
+    digest = token_digest(caller.prefix, token_id)
+    line = await gate.query(lambda: runtime.store.audit_log.use_of(digest))
+    if line is None or line.pseudonym != pseudonym:
         line = None
     return answer(
         request,

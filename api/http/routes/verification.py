@@ -2,15 +2,13 @@
 
 The order of a verification, which is what bounds an attacker::
 
-    body read ─▶ locked out, or nonce used? template ─▶ probe, decision
-        ─▶ one transaction: nonce used up, lockout checked and counted, audit line ─▶ answer
+    body read ─▶ locked out, or token used? template ─▶ probe, decision
+        ─▶ one write: token used up, lockout checked and counted, audit line ─▶ answer
 
-No decision leaves before that transaction has committed. So of requests that run at the same time
+No decision leaves before that write has committed. So of requests that run at the same time
 no more are answered than of requests that come one after the other.
 """
 
-import contextlib
-from dataclasses import dataclass, replace
 from typing import Any
 
 from fastapi import APIRouter, Request
@@ -30,21 +28,9 @@ from api.process.runtime import Runtime
 from templates.errors import ContractMismatch
 from templates.store.attempts import Attempt
 from templates.store.audit_log import By
-from templates.store.lockout import Superseded
-from templates.store.tenants import RetiredRotation
-from verify import (
-    Decision,
-    OpenedTemplate,
-    StandIn,
-    Verifier,
-)
+from verify import Decision
 
 router = APIRouter(prefix="/v1/subjects", tags=["subjects"])
-
-DECISIONS = 3
-"""Times that a probe is decided while others may replace the template before the record; then they
-must wait for it."""
-
 
 CODES = (
     *EVERY_CALL,
@@ -95,8 +81,7 @@ async def verify(
     A subject that does not exist is answered as one that does not match, in the same shape and
     with the same work, and so is one that was enrolled under another contract; only keys with
     `enroll` or `admin` are told `not_enrolled` or `contract_mismatch`. The distance is returned
-    only to keys with `scores`, of a rejection where a holder's key is needed only to those that
-    have `enroll` or `admin` too: others are told the one that an unknown subject would have.
+    only to keys with `scores` and `enroll`.
 
     A token for this subject may stand in the place of the API key; the decision uses it up.
     """
@@ -108,7 +93,7 @@ async def verify(
             if caller.subject_token is not None:
                 # Once more: the body and the turn to compute may have taken a while.
                 caller.subject_token.require_in_time()
-            return _decide_and_record(runtime, caller, subject, probe, by(request))
+            return _decide(runtime, caller, subject, probe, by(request))
 
         decision = await gate.compute(wiping(probe.holder_key, work), key=caller.prefix)
     body = _body(decision, caller)
@@ -131,7 +116,7 @@ def _body(decision: Decision, caller: Caller) -> dict[str, Any]:
         "contract_id": decision.contract_id,
         "calibration_id": decision.calibration_id,
     }
-    if "scores" in caller.rights:
+    if {"scores", "enroll"} <= caller.rights:
         body["distance"] = decision.distance
         if decision.liveness_failure is not None:
             body["liveness_failure"] = str(decision.liveness_failure)
@@ -140,90 +125,27 @@ def _body(decision: Decision, caller: Caller) -> dict[str, Any]:
     return body
 
 
-def _decide_and_record(
-    runtime: Runtime, caller: Caller, subject: str, probe: Probe, who: By
-) -> Decision:
-    """Decide and record; a template that was replaced or erased meanwhile accepts nobody."""
-    attempts, contract_id = runtime.store.attempts, runtime.contract.contract_id
+def _decide(runtime: Runtime, caller: Caller, subject: str, probe: Probe, who: By) -> Decision:
+    """Decide and record; a subject that is not enrolled costs what an enrolled one does."""
 
     def compare(attempt: Attempt) -> Decision:
-        return _decided(probe, _opened(runtime, caller, subject, attempt))
+        template = attempt.template
+        if template is not None:
+            verifier = runtime.verifier(caller.tenant, template.record.rotation_epoch)
+            return probe.compare(verifier, template)
+        if caller.sees_enrollment:
+            raise _why_not(runtime, caller.tenant, subject)
+        verifier = runtime.verifier(caller.tenant, attempt.rotation_epoch)
+        return probe.compare(verifier, runtime.stand_in.open())
 
-    for _ in range(DECISIONS):
-        # A retired rotation: the template was moved into a newer epoch between the two looks.
-        with contextlib.suppress(Superseded, RetiredRotation):
-            # In one step, which metrics show: it must not tell who is enrolled.
-            with step("store"):
-                attempt = attempts.begin(
-                    caller.tenant,
-                    subject,
-                    contract_id=contract_id,
-                    nonce=probe.nonce,
-                )
-                opened = _opened(runtime, caller, subject, attempt)
-            decision = _decided(probe, opened)
-            with step("record"):
-                attempts.conclude(
-                    caller.tenant,
-                    subject,
-                    accepted=decision.accepted,
-                    template_id=attempt.template_id,
-                    contract_id=contract_id,
-                    level=decision.level,
-                    nonce=probe.nonce,
-                    by=who,
-                )
-            return decision
-    return attempts.decide_alone(
+    return runtime.store.attempts.decide(
         caller.tenant,
         subject,
         compare,
-        contract_id=contract_id,
-        nonce=probe.nonce,
+        contract_id=runtime.contract.contract_id,
+        token=probe.token,
         by=who,
     )
-
-
-@dataclass(frozen=True)
-class _Opened:
-    """What compares, and with what.
-
-    `nobody` is the subject's stand-in where the caller is told distances and not who is enrolled.
-    """
-
-    verifier: Verifier
-    stored: OpenedTemplate
-    nobody: StandIn | None
-
-
-def _decided(probe: Probe, opened: _Opened) -> Decision:
-    decision = probe.compare(opened.verifier, opened.stored)
-    if opened.nobody is None:
-        return decision
-    # A wrong holder's key turns the probe away from all faces: the distance would tell that a key
-    # is needed, and so that somebody is enrolled. Compared for every subject: the time tells.
-    unknown = probe.compare(opened.verifier, opened.nobody)
-    if decision.accepted or opened.stored.holder_salt is None:
-        return decision
-    return replace(decision, distance=unknown.distance)
-
-
-def _opened(runtime: Runtime, caller: Caller, subject: str, attempt: Attempt) -> _Opened:
-    """Open the subject's template, or one of nobody."""
-    template, tenant = attempt.template, caller.tenant
-    lifted = None
-    if "scores" in caller.rights and not caller.sees_enrollment:
-        # The distance will be told. Lifted for every subject, enrolled or not: the time tells.
-        lifted = runtime.stand_ins.lift(tenant, subject)
-    stored: OpenedTemplate
-    if template is not None:
-        stored, epoch = template, template.record.rotation_epoch
-    elif caller.sees_enrollment:
-        raise _why_not(runtime, tenant, subject)
-    else:
-        stored, epoch = runtime.stand_ins.open(lifted), attempt.rotation_epoch
-    nobody = None if lifted is None else StandIn(stored.wire, lifted)
-    return _Opened(runtime.verifier(tenant, epoch), stored, nobody)
 
 
 def _why_not(runtime: Runtime, tenant: str, subject: str) -> Exception:

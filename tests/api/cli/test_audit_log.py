@@ -1,8 +1,11 @@
+import base64
 import json
 import sqlite3
 
 import pytest
 
+from api.process.opening import open_keyring, open_store
+from api.settings import Settings
 from tests.api.cli.conftest import copied, run
 
 
@@ -32,11 +35,6 @@ def log(veilface):
 def tamper(data, statement):
     """Change the table as somebody may who owns the database."""
     with sqlite3.connect(data / "veilface.db") as connection:
-        names = connection.execute(
-            "SELECT name FROM sqlite_master WHERE type = 'trigger'"
-        ).fetchall()
-        for (name,) in names:
-            connection.execute(f'DROP TRIGGER "{name}"')
         assert connection.execute(statement).rowcount > 0
     connection.close()
 
@@ -81,22 +79,50 @@ def test_an_unknown_tenant_has_no_empty_log(log):
 
 
 @pytest.mark.parametrize(
-    ("statement", "said"),
+    ("statement", "problem", "record"),
     [
-        ("UPDATE audit_log SET outcome = 'accept' WHERE outcome = 'reject'", "altered"),
-        ("DELETE FROM audit_log WHERE sequence = 2", "missing"),
-        ("DELETE FROM audit_log WHERE sequence = (SELECT max(sequence) FROM audit_log)", "missing"),
-        ("UPDATE audit_head SET sequence = sequence - 1", "head"),
+        ("DELETE FROM audit_log WHERE sequence = 2", "missing", None),
+        ("UPDATE api_keys SET rights = 'admin'", None, "made up or altered"),
     ],
 )
-def test_a_tampered_log_is_told(log, data, statement, said):
+def test_what_was_tampered_with_is_told(log, data, statement, problem, record):
     tamper(data, statement)
     ran = log("audit-log", "verify")
     assert ran.status == 1
-    assert said in ran.stderr
+    assert (problem or record) in ran.stderr
     ran = log("audit-log", "verify", "--json")
     assert (ran.status, ran.json["intact"]) == (1, False)
-    assert ran.json["problems"]
+    assert ran.json["problem"] == (problem and {"sequence": 2, "problem": problem})
+    assert bool(ran.json["records"]) is (record is not None)
+    assert all(record in told["problem"] for told in ran.json["records"])
+
+
+def test_lines_move_into_an_archive(log, data, tmp_path):
+    file, moved = tmp_path / "old.jsonl", log("audit-log", "head", "--json").json["sequence"]
+    with sqlite3.connect(data / "veilface.db") as connection:
+        (mac,) = connection.execute("SELECT mac FROM audit_log WHERE sequence = 2").fetchone()
+    ran = log("audit-log", "archive", file, "--through", "2", "--json")
+    assert ran.json == {"lines": 2, "base": f"0:{'0' * 64}", "last": f"2:{mac.hex()}"}
+    assert [line["sequence"] for line in lines(log("audit-log", "show"))] == [*range(3, moved + 2)]
+    assert log("audit-log", "verify").status == 0
+    refused = log("audit-log", "archive", file)
+    assert refused.status == 1
+    assert "cannot be written" in refused.stderr
+    key = public_key(data)
+    checked = ("audit-log", "verify-archive", file, "--public-key")
+    assert run(*checked, key, "--json").json == ran.json
+    file.write_text(file.read_text().replace("created", "deleted"))
+    assert run(*checked, key).status == 1
+    assert run(*checked, "%%").status == 2
+
+
+def public_key(data):
+    settings = Settings(data_dir=data)
+    store = open_store(settings, open_keyring(settings))
+    try:
+        return base64.b64encode(store.signer.public_key()).decode()
+    finally:
+        store.close()
 
 
 def test_an_anchor_finds_a_log_that_was_put_back(log, data, tmp_path, world):

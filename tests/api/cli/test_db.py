@@ -1,6 +1,7 @@
 import base64
 import json
 import sqlite3
+from types import SimpleNamespace
 
 import pytest
 
@@ -111,15 +112,8 @@ def opened(tmp_path):
 
 
 def reject(store, subject, tenant="default"):
-    store.attempts.conclude(
-        tenant,
-        subject,
-        accepted=False,
-        template_id=None,
-        level="x",
-        nonce=None,
-        by=By(),
-    )
+    decided = SimpleNamespace(accepted=False, level="x")
+    store.attempts.decide(tenant, subject, lambda _: decided, contract_id="c" * 64, by=By())
 
 
 def test_unlock_forgets_failures(opened):

@@ -27,6 +27,7 @@ PROMISED = {
     *("keys verify-receipt", "keys replace", "keys rotate-tenant", "keys renew"),
     *("db unlock", "db purge", "db erase-tenant", "db template-enrollment"),
     *("audit-log verify", "audit-log head", "audit-log show"),
+    *("audit-log archive", "audit-log verify-archive"),
     *("bench distances", "bench models"),
 }
 

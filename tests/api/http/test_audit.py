@@ -6,8 +6,7 @@ from typing import Any
 import pytest
 
 from api.http.schemas import AuditLogAnswer
-from templates.store.audit_chain import Line
-from templates.store.audit_log import AuditLog
+from templates.store.audit_log import AuditLog, Line
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, images, photo
 from tests.api.http.test_enrollment import b64, lifted

@@ -120,7 +120,7 @@ def test_a_challenge_is_good_for_one_decision(active: Service) -> None:
     for headers in ({}, other):
         again = answered(client, asked["challenge_id"], frames, headers=headers)
         assert_error(again, 401, "replayed")
-        assert "seen before" in again.json()["error"]["message"]
+        assert "used before" in again.json()["error"]["message"]
     # A rejection uses it up as well, whichever key it comes with.
     asked = challenge(client)
     frames = frames_of(performed(asked["movements"]))

@@ -257,25 +257,3 @@ def test_an_import_needs_the_same_key(pair: tuple[Client, Client]) -> None:
     assert decided(second, "moves", KEY) == "accept"
     for key in (OTHER, None):
         assert decided(second, "moves", key) == "reject"
-
-
-def test_no_distance_tells_that_a_key_is_needed(client: Client, deployment: Deployment) -> None:
-    """A rejection has the distance that the subject has when it is not enrolled."""
-    scores = bearer(deployment.key("verify", "scores"))
-    enroll(client, "measured")
-    rejected = [
-        verify(client, "measured", key, person=person, headers=scores)["distance"]
-        for key, person in ((OTHER, 1), (None, 1), (KEY, 2))
-    ]
-    accepted = verify(client, "measured", KEY, headers=scores)
-    assert accepted["decision"] == "accept"
-    # Who may know what is enrolled is told the distance to the template.
-    told = verify(client, "measured", KEY, person=2)["distance"]
-    assert client.delete("/v1/subjects/measured").status_code == 200
-    unknown = [
-        verify(client, "measured", KEY, person=person, headers=scores)["distance"]
-        for person in (1, 1, 2)
-    ]
-    assert rejected == unknown
-    assert accepted["distance"] not in unknown
-    assert told not in unknown

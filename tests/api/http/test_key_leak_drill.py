@@ -1,7 +1,6 @@
 """The drill of docs/threat-model.md: the database, the master key and an API key were stolen."""
 
 import base64
-import hashlib
 import json
 import shutil
 from datetime import UTC, datetime
@@ -14,27 +13,27 @@ import sqlalchemy as sa
 from numpy.typing import NDArray
 
 from api.http.app import create_app
-from api.http.stand_ins import StandIns
+from api.http.receipts import read_receipt_key
 from api.http.transfer import ExportKey, open_export
 from templates.contract import wire
 from templates.decoys import DecoySource, client_source
-from templates.errors import InvalidTemplate, SealError, StoreError
+from templates.errors import InvalidTemplate, SealError
 from templates.keys.rotation import TenantRotation
 from templates.keys.sealing import MasterKeyring
 from templates.space.subspace import AffineSubspace
-from templates.store import Anchor, Line, TemplateStore
-from templates.store.audit_chain import head_mac, line_hash
-from templates.store.authenticity import row_mac
+from templates.store import TemplateStore
+from templates.store.audit_archive import verify_archive
+from templates.store.audit_log import Anchor, Head, Line, head_columns, line_mac
 from templates.store.database import Database
 from templates.store.receipts import sign_claims
-from templates.store.renewal import KEPT
 from templates.store.schema import ApiKeyRow, AuditHeadRow, AuditRow
-from templates.store.secret import SecretName
+from templates.store.secrets import SecretName
 from tests.api.cli.conftest import run
 from tests.api.client import Client
 from tests.api.deployment import AXES, Deployment, bearer, deploy, images, photo, picture
 from tests.api.shapes import assert_error
 
+FORGET_MADE_UP = "DELETE FROM api_keys WHERE label = 'made up'"
 PEOPLE = {"alice": 1, "bob": 2}
 FACES = {**PEOPLE, "carol": 3}
 
@@ -53,7 +52,6 @@ class Thief:
             f"sqlite:///{folder / 'veilface.db'}", MasterKeyring.load(folder / "master.key")
         )
         self.secrets = {name: self.store.secrets.get(name) for name in SecretName}
-        self.row_key = self.store.audit_log.row_key()
 
     def stolen(self, subject: str) -> AffineSubspace:
         """The template, turned back."""
@@ -74,54 +72,40 @@ class Thief:
         answers = [self.log_in(client, subject, token, vector).json() for vector in vectors]
         return [str(answer["decision"]) for answer in answers]
 
-    def receipt(self, like: dict[str, Any], erased_at: str) -> dict[str, Any]:
+    def receipt(self, like: dict[str, Any]) -> dict[str, Any]:
         """A receipt under the stolen key."""
-        claims = {**json.loads(like["receipt"]["body"]), "erased_at": erased_at}
-        made_up = sign_claims(claims, self.secrets[SecretName.RECEIPT].value)
-        return {"receipt": made_up.to_json()}
+        claims = json.loads(like["receipt"]["body"])
+        return {"receipt": sign_claims(claims, self.secrets[SecretName.RECEIPT]).to_json()}
 
     def made_up_key(self, database: Database) -> str:
-        """Put a key of all rights into the service's database, authentic under the stolen key."""
-        (row,) = _rows(database, "SELECT * FROM api_keys LIMIT 1")
-        prefix, token = "0123456789ab", f"vf_0123456789ab_{'5' * 64}"
-        row |= {"id": "7" * 32, "prefix": prefix, "line": 0, "expires_at": None}
-        row |= {"token_hash": hashlib.sha256(token.encode()).digest(), "rights": "admin,verify"}
-        authentic = {
-            **row,
-            "tenant": "default",
-            "created_at": datetime.fromisoformat(row["created_at"]).replace(tzinfo=UTC),
-        }
-        row["mac"] = row_mac(self.row_key, ApiKeyRow, authentic)
-        names = ", ".join(row)
-        values = ", ".join(f":{name}" for name in row)
-        _write(database, f"INSERT INTO api_keys ({names}) VALUES ({values})", row)
-        return token
+        """Make a key with the stolen secrets, and put its row into the service's database."""
+        new = self.store.api_keys.create("default", ["admin", "erase", "verify"], label="made up")
+        row = _read(self.store.database, ApiKeyRow, ApiKeyRow.label == "made up")
+        database.write(lambda connection: connection.execute(sa.insert(ApiKeyRow).values(row)))
+        self.store.database.write(lambda connection: connection.execute(sa.text(FORGET_MADE_UP)))
+        return new.token
 
-    def write_line(self, database: Database, last: Anchor) -> None:
+    def write_line(self, database: Database) -> None:
         """Add a line under the stolen key, and move the head."""
-        columns: dict[str, Any] = dict.fromkeys(Line.__dataclass_fields__)
-        columns |= {"sequence": last.sequence + 1, "action": "erase", "outcome": "erased"}
-        columns |= {"previous_hash": last.hash, "at": datetime.now(UTC)}
-        key = self.secrets[SecretName.CHAIN].value
-        own_hash = line_hash(key, columns)
-        head = Anchor(last.sequence + 1, own_hash)
-        database.write(
-            lambda connection: connection.execute(
-                sa.insert(AuditRow).values(**{**columns, "hash": own_hash})
-            )
-        )
-        moved = {"sequence": head.sequence, "hash": own_hash, "mac": head_mac(key, head)}
-        database.write(lambda connection: connection.execute(sa.update(AuditHeadRow).values(moved)))
+        key = self.secrets[SecretName.CHAIN]
+        row = _read(database, AuditHeadRow, AuditHeadRow.id == 1)
+        last = Anchor(row["sequence"], row["line_mac"])
+        line: dict[str, Any] = dict.fromkeys(Line.__dataclass_fields__)
+        line |= {"sequence": last.sequence + 1, "action": "erase", "outcome": "erased"}
+        line |= {"actor": "program", "at": datetime.now(UTC).isoformat()}
+        line["mac"] = line_mac(key, line, last.mac)
+        base = Anchor(row["base_sequence"], row["base_mac"])
+        head = head_columns(Head(base, Anchor(line["sequence"], line["mac"])), key)
+        for statement in (
+            sa.insert(AuditRow).values(line),
+            sa.update(AuditHeadRow).values(head),
+        ):
+            database.write(lambda connection, made=statement: connection.execute(made))
 
 
-def _rows(database: Database, statement: str) -> list[dict[str, Any]]:
-    return database.read(
-        lambda connection: [row._asdict() for row in connection.execute(sa.text(statement))]
-    )
-
-
-def _write(database: Database, statement: str, values: dict[str, Any]) -> None:
-    database.write(lambda connection: connection.execute(sa.text(statement), values))
+def _read(database: Database, table: type[Any], condition: Any) -> dict[str, Any]:
+    query = sa.select(table.__table__).where(condition)
+    return database.read(lambda connection: connection.execute(query).one()._asdict())
 
 
 def unit_vectors(
@@ -193,7 +177,8 @@ def test_the_drill(tmp_path: Path) -> None:
         assert enroll(client, "carol", deployment.token, 0) == 201
         backup = exported(client, "carol", deployment.token)
         receipt = client.delete("/v1/subjects/carol", headers=bearer(deployment.token)).json()
-        anchor = operator(deployment, "audit-log", "head")
+        contract = client.get("/v1/contract", headers=bearer(deployment.token)).json()
+        assert verified(tmp_path, receipt, contract)
         thief = Thief(deployment, deployment.token, tmp_path / "loot")
         pack = client.app.state.runtime.pack
         faces = {who: pack.embed(picture(PEOPLE[who], 9)[np.newaxis])[0] for who in PEOPLE}
@@ -202,17 +187,20 @@ def test_the_drill(tmp_path: Path) -> None:
         }
         # The theft is one: every vector of the template is accepted.
         assert set(thief.decisions(client, "alice", thief.token, forged["alice"])) == {"accept"}
+        made_up = thief.made_up_key(service)
+        assert client.get("/v1/audit-log", headers=bearer(made_up)).status_code == 200
 
-        done = operator(deployment, "keys", "renew")
-        prefix = deployment.token[3:15]
-        assert done["replace_api_keys"] == [prefix]
-        (tenant,) = done["tenants"]
-        assert tenant["enroll_again"] == ["alice", "bob"]
-        assert (done["retired"], set(done["secrets"])) == (1, set(SecretName) - KEPT)
-        done_anchor = done["anchor"]
-        token = operator(deployment, "keys", "replace", prefix, "--grace-hours", "0")["token"]
+    # The service is stopped.
+    service.write(lambda connection: connection.execute(sa.text(FORGET_MADE_UP)))
+    archive = tmp_path / "before.jsonl"
+    done = operator(deployment, "keys", "renew", str(archive))
+    prefix = deployment.token[3:15]
+    assert (done["retired"], done["replace_api_keys"]) == (1, [prefix])
+    assert done["enroll_again"] == {"default": ["alice", "bob"]}
+    token = operator(deployment, "keys", "replace", prefix, "--grace-hours", "0")["token"]
 
-        # The service ran all the while, and everybody can still log in with a photo.
+    with Client(create_app(deployment.settings)) as client:
+        # Everybody can still log in with a photo.
         for subject in PEOPLE:
             assert decision(client, subject, token, 7) == "accept"
         refused = thief.log_in(client, "alice", thief.token, forged["alice"][0])
@@ -220,23 +208,16 @@ def test_the_drill(tmp_path: Path) -> None:
         # A stolen template stays a credential for whoever gets another key that may send it.
         assert set(thief.decisions(client, "alice", token, forged["alice"])) == {"accept"}
 
-        # The service ran all the while: no worker takes a key that the stolen secret vouches for.
+        # Nothing that the stolen secrets make is good for anything.
         made_up = thief.made_up_key(service)
         assert_error(client.get("/v1/contract", headers=bearer(made_up)), 401, "unauthorized")
-        _write(service, "DELETE FROM api_keys WHERE prefix = '0123456789ab'", {})
-
-        contract = client.get("/v1/contract", headers=bearer(token)).json()
-        good = verified(tmp_path, receipt, contract)
-        assert good["key_id"] == receipt["claims"]["signing_key"]
-        assert good["key_retired_at"] is not None
-        late = thief.receipt(receipt, datetime.now(UTC).isoformat())
-        assert verified(tmp_path, late, contract) is None
+        service.write(lambda connection: connection.execute(sa.text(FORGET_MADE_UP)))
+        before, contract = contract, client.get("/v1/contract", headers=bearer(token)).json()
         again = client.delete("/v1/subjects/carol", headers=bearer(token)).json()
         assert again["claims"]["receipt_id"] == receipt["claims"]["receipt_id"]
-        assert verified(tmp_path, again, contract)["key_retired_at"] is None
-        back_dated = thief.receipt(receipt, receipt["claims"]["erased_at"])
-        assert verified(tmp_path, back_dated, contract)["key_retired_at"] is not None
-
+        assert verified(tmp_path, again, contract)
+        assert verified(tmp_path, receipt, contract) is None
+        assert verified(tmp_path, thief.receipt(again), contract) is None
         stolen_key = ExportKey.from_secret(thief.secrets[SecretName.EXPORT])
         opening = {"key": stolen_key, "tenant": "default"}
         contract_id = deployment.contract.contract_id
@@ -244,23 +225,6 @@ def test_the_drill(tmp_path: Path) -> None:
         with pytest.raises(InvalidTemplate):
             open_export(exported(client, "bob", token), contract_id=contract_id, **opening)
         assert_error(imported(client, backup, token), 400, "invalid_template")
-
-        runtime = client.app.state.runtime
-        stand_in = runtime.stand_ins.lift("default", "nobody")
-        stolen_stand_in = StandIns(
-            deployment.contract.nobody(deployment.source),
-            runtime.keyring,
-            contract_id=deployment.contract.contract_id,
-            key=lambda: thief.secrets[SecretName.STAND_INS].value,
-        ).lift("default", "nobody")
-        assert (stand_in.foot != stolen_stand_in.foot).any()
-        assert (
-            thief.store.signer.pseudonym("default", "alice")
-            == runtime.store.signer.pseudonyms("default", "alice")[-1]
-        )
-        assert thief.store.signer.pseudonym("default", "alice") != runtime.store.signer.pseudonym(
-            "default", "alice"
-        )
 
         for subject in PEOPLE:
             assert enroll(client, subject, token, 2, 3) == 200
@@ -278,20 +242,19 @@ def test_the_drill(tmp_path: Path) -> None:
         deployment.settings.resolved_database_url,
         MasterKeyring.load(thief.folder / "master.key"),
     )
-    with pytest.raises(SealError):
-        second.subjects.get("default", "alice")
-    with pytest.raises((SealError, StoreError)):
-        second.tenants.rotation_key("default")
-    with pytest.raises(SealError):
-        second.audit_log.head()
+    for read in (
+        lambda: second.subjects.get("default", "alice"),
+        lambda: second.tenants.rotation_key("default"),
+        second.audit_log.head,
+    ):
+        with pytest.raises(SealError):
+            read()
     second.close()
 
-    # The chain leads from before the theft to now; a line of the thief's does not pass.
-    before = f"{anchor['sequence']}:{anchor['hash']}"
-    for kept in (before, done_anchor):
-        assert operator(deployment, "audit-log", "verify", "--anchor", kept)["intact"]
-    head = operator(deployment, "audit-log", "head")
-    thief.write_line(service, Anchor(head["sequence"], bytes.fromhex(head["hash"])))
+    # The archive and the log are whole, and a line of the thief's does not pass.
+    assert verify_archive(archive, read_receipt_key(before["receipt_key"])).lines > 0
+    assert operator(deployment, "audit-log", "verify")["intact"]
+    thief.write_line(service)
     ran = run("audit-log", "verify", "--data-dir", deployment.settings.data_dir, "--json")
     assert (ran.status, ran.json["intact"]) == (1, False)
     service.close()

@@ -186,7 +186,7 @@ def test_hill_climbing_ends_at_the_lockout(both: tuple[Client, Deployment], scor
     """The climber of the audit, over REST: it gets five answers, and none of them is an accept."""
     client, deployment = both
     enroll(client)
-    token = deployment.key("verify", "embeddings", *(["scores"] if scores else []))
+    token = deployment.key("verify", "embeddings", *(["scores", "enroll"] if scores else []))
     rng, answered = np.random.default_rng(0), 0
     best, best_score = rng.normal(size=64), -np.inf
     for _ in range(50):

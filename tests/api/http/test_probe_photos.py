@@ -22,7 +22,7 @@ def scored(client: Client, deployment: Deployment) -> str:
     """A key that is told distances and may send embeddings; ``alice`` is person 1."""
     answer = client.put("/v1/subjects/alice/enrollment", files=images(photo(1), photo(1, 1)))
     assert answer.status_code == 201
-    return deployment.key("verify", "scores", "embeddings")
+    return deployment.key("verify", "scores", "enroll", "embeddings")
 
 
 def decided(answer: Any) -> dict[str, Any]:
@@ -57,13 +57,15 @@ def test_embeddings_are_averaged(client: Client, scored: str) -> None:
         assert several["distance"] == pytest.approx(mean["distance"], abs=1e-5)
 
 
-def test_two_people_in_one_burst_are_refused_by_number(client: Client, scored: str) -> None:
+def test_two_people_in_one_burst_are_refused_by_number(
+    client: Client, scored: str, deployment: Deployment
+) -> None:
     mixed = [(1, 5), (2, 5), (1, 6), (1, 7)]
     photos = images(*(photo(*each) for each in mixed))
     rows = [embedding(client, *each) for each in mixed]
-    for subject in ("alice", "nobody"):
+    for subject, token in (("alice", scored), ("nobody", deployment.key("verify", "embeddings"))):
         for request in ({"files": photos}, {"json": {"embeddings": rows}}):
-            answer = ask(client, scored, subject, **request)
+            answer = ask(client, token, subject, **request)
             assert assert_error(answer, 422, "inconsistent_images") == {"photos": [1]}
             assert answer.json()["error"]["message"].startswith(
                 "photo 2 does not look like the person on photos 1, 3 and 4;"

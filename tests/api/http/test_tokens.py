@@ -2,7 +2,7 @@
 
 import base64
 import threading
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -12,6 +12,7 @@ import pytest
 
 from api.http import holder_keys
 from api.http.app import create_app
+from api.http.challenges import LIFETIME
 from api.http.schemas import (
     ContractAnswer,
     EnrollmentAnswer,
@@ -19,9 +20,10 @@ from api.http.schemas import (
     TokenOutcomeAnswer,
     VerifyAnswer,
 )
-from api.http.tokens import SubjectToken, new_token
+from api.http.tokens import LONGEST_S, SubjectToken, new_token
 from api.process.opening import open_keyring, open_store
 from templates.keys.holder_key import decode_holder_key
+from templates.store.audit_archive import TOKENS_LAST
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, deploy, images, photo
 from tests.api.http.test_enrollment import b64, lifted
@@ -157,6 +159,21 @@ def test_of_eight_uses_at_once_one_passes(service: Service, action: str) -> None
             assert_error(answer, 401, "replayed")
     with Client(create_app(deployment.settings)) as restarted:
         assert_error(use(restarted, token, 1, "alice"), 401, "replayed")
+
+
+def test_an_archive_does_not_make_a_used_token_good_again(service: Service, tmp_path: Path) -> None:
+    client, deployment = service
+    assert max(timedelta(seconds=LONGEST_S), LIFETIME) < TOKENS_LAST
+    issued = issue(client)
+    assert verify(client, issued["token"]).status_code == 200
+    store = open_store(deployment.settings, open_keyring(deployment.settings))
+    try:
+        use = store.audit_log.head().sequence
+        moved = store.archive_audit_log(tmp_path / "archive", through=None)
+        assert moved.last.sequence == use - 1
+    finally:
+        store.close()
+    assert_error(verify(client, issued["token"]), 401, "replayed")
 
 
 def test_a_token_outlives_a_restart_and_its_key_does_not(service: Service) -> None:
@@ -517,8 +534,9 @@ def test_the_audit_log_and_the_metrics_tell_of_tokens(service: Service) -> None:
     assert 'veilface_tokens_total{action="verify"}' in text
     store = open_store(deployment.settings, open_keyring(deployment.settings))
     try:
-        assert store.audit_log.verify().intact
-        assert not store.check_records()
+        walk, records = store.verify_audit_log()
+        assert walk.intact
+        assert not records
     finally:
         store.close()
 

@@ -14,7 +14,6 @@ from api.process.runtime import Runtime
 from templates.contract import wire
 from templates.errors import ContractMismatch, InvalidTemplate
 from templates.keys.sealing import MasterKeyring
-from templates.store.secret import Secret
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, deploy, images, photo
 from tests.api.shapes import assert_answer, assert_error
@@ -170,7 +169,7 @@ def test_what_the_key_holder_sealed_is_still_checked(
 
 
 def test_export_key_binds_contract_and_tenant() -> None:
-    key = ExportKey.from_secret(Secret(os.urandom(32)))
+    key = ExportKey.from_secret(os.urandom(32))
     blob = seal_export(Exported("s", CONTRACT, "photos", 1, b"wire"), key=key, tenant="t")
     opened = open_export(blob, key=key, tenant="t", contract_id=CONTRACT)
     assert opened == Exported("s", CONTRACT, "photos", 1, b"wire")

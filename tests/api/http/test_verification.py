@@ -1,5 +1,4 @@
 import math
-import os
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +7,6 @@ import pytest
 
 from api.http.app import create_app
 from api.http.schemas import VerifyAnswer
-from api.http.stand_ins import StandIns
 from templates.contract import wire
 from templates.keys.randomness import Keystream
 from templates.keys.sealing import MasterKeyring
@@ -139,47 +137,18 @@ def counting_cipher(steps: list[str]) -> type:
     return Counting
 
 
-def test_distance_only_with_the_right_to_scores(
-    client: Client, token: str, deployment: Deployment
-) -> None:
-    scored = deployment.key("verify", "scores")
-    for subject in ("alice", "nobody"):
+def test_distance_only_with_scores_and_enroll(client: Client, deployment: Deployment) -> None:
+    for rights, told in (
+        (("scores",), set()),
+        (("enroll",), set()),
+        (("scores", "enroll"), {"distance"}),
+    ):
+        token = deployment.key("verify", *rights)
         body = assert_answer(
-            ask(client, scored, subject, files=images(photo(2), name="image")), 200, VerifyAnswer
+            ask(client, token, files=images(photo(2), name="image")), 200, VerifyAnswer
         )
-        assert set(body) == PRODUCT_KEYS | {"distance"}
-        assert 0 < body["distance"] <= 2
-
-
-def test_distances_do_not_tell_who_is_unknown(client: Client, deployment: Deployment) -> None:
-    rights = ("verify", "scores", "embeddings")
-    descriptor = embedding(client, 2)
-
-    def distance(subject: str, tenant: str = "default") -> float:
-        scored = deployment.key(*rights, tenant=tenant)
-        answer = ask(client, scored, subject, json={"embedding": descriptor})
-        return float(assert_answer(answer, 200, VerifyAnswer)["distance"])
-
-    distances = [distance(f"unknown-{i}") for i in range(8)]
-    assert len(set(distances)) == 8
-    assert distances[0] == distance("unknown-0")
-    # Other tenants and other deployments give the same name another stand-in.
-    assert distance("unknown-0", tenant="elsewhere") != distances[0]
-    keyring, foreign = client.app.state.runtime.keyring, os.urandom(32)
-    contract = deployment.contract
-    other = StandIns(
-        contract.nobody(deployment.source),
-        keyring,
-        contract_id=contract.contract_id,
-        key=lambda: foreign,
-    )
-    own = client.app.state.runtime.stand_ins
-    told, elsewhere = (each.lift("default", "unknown-0") for each in (own, other))
-    assert (told.foot != elsewhere.foot).any()
-    point = deployment.source.project(np.array([descriptor], dtype=np.float32))[0]
-    assert np.sqrt(
-        2 - 2 * (told.foot @ point + told.radius * np.linalg.norm(told.basis @ point))
-    ) == pytest.approx(distances[0], abs=1e-4)
+        assert set(body) == PRODUCT_KEYS | told
+    assert 0 < body["distance"] <= 2
 
 
 def test_embeddings_and_lifted_probes(client: Client, sender: str, deployment: Deployment) -> None:

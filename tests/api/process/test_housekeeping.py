@@ -3,6 +3,7 @@
 import json
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import sqlalchemy as sa
@@ -35,9 +36,8 @@ def expire_all(store: TemplateStore) -> None:
 
 def fail(store: TemplateStore, subject: str) -> None:
     """Count a failure on somebody who is not enrolled."""
-    store.attempts.conclude(
-        "default", subject, accepted=False, template_id=None, level="m", nonce=None, by=By()
-    )
+    decided = SimpleNamespace(accepted=False, level="m")
+    store.attempts.decide("default", subject, lambda _: decided, contract_id="c" * 64, by=By())
 
 
 def test_expired_records_go_at_the_start_and_later(own: Deployment) -> None:

@@ -94,7 +94,7 @@ def test_a_decision_is_counted_with_its_level_and_kind_of_probe(client: Client) 
     for decision, reason, times in (("accept", "match", 2), ("reject", "no_match", 1)):
         labels = {"decision": decision, "reason": reason, "level": level, "probe": "photo"}
         assert rise("veilface_decisions_total", **labels) == times
-    for name in ("body", "photo", "store", "decide"):
+    for name in ("body", "photo", "decide"):
         assert rise("veilface_step_seconds_count", step=name) >= 3, name
 
 

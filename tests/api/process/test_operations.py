@@ -85,7 +85,7 @@ def test_after_a_failed_write_a_write_must_succeed(both: tuple[Client, Deploymen
     store = client.app.state.runtime.store
     enroll = {"path": "/v1/subjects/a/enrollment", "files": images(photo(1))}
     assert client.get(READY).status_code == 200
-    tables = ("templates", "master_key_check")
+    tables = ("templates", "secrets")
     refuse_writes(store, *tables)
     # Nobody has tried to write yet: a database that answers is taken for one that works.
     assert client.get(READY).status_code == 200
@@ -104,7 +104,7 @@ def test_after_a_failed_write_a_write_must_succeed(both: tuple[Client, Deploymen
 def test_a_trial_write_changes_nothing(both: tuple[Client, Deployment]) -> None:
     client, _ = both
     store = client.app.state.runtime.store
-    row = sa.text("SELECT * FROM master_key_check")
+    row = sa.text("SELECT * FROM secrets ORDER BY name")
 
     def rows() -> list[Any]:
         return store.database.read(lambda each: [tuple(r) for r in each.execute(row)])
@@ -112,7 +112,7 @@ def test_a_trial_write_changes_nothing(both: tuple[Client, Deployment]) -> None:
     before = rows()
     store.ping_write()
     assert rows() == before
-    assert len(before) == 1
+    assert before
 
 
 def test_after_a_failed_inference_one_must_succeed(
@@ -163,11 +163,11 @@ def test_recovery_is_seen_without_anybody_asking(
     )
     with Client(create_app(deployment.settings)) as client:
         store = client.app.state.runtime.store
-        refuse_writes(store, "master_key_check")
+        refuse_writes(store, "secrets")
         client.app.state.readiness.note(_store_error())
         time.sleep(0.3)
         assert STORE_UP._value.get() == 0
-        take_writes(store, "master_key_check")
+        take_writes(store, "secrets")
         wait_until(lambda: STORE_UP._value.get() == 1, what="the store's recovery")
     lines = [json.loads(line) for line in capfd.readouterr().err.splitlines()]
     said = [line["event"] for line in lines if line["event"].startswith("store")]

@@ -116,10 +116,7 @@ def test_a_slot_for_each_processor_that_the_process_may_use(
         ("liveness = 'perhaps'", "setting liveness"),
         ("retention_days = 0", "setting retention_days"),
         ("master_key_variable = 'a-b'", "setting master_key_variable"),
-        ("master_key_command = '  '", "is empty"),
-        ('master_key_command = "a \'b"', "quotation"),
         ("master_key_file = 'k'\nmaster_key_variable = 'K'", "give one of"),
-        ("master_key_variable = 'K'\nmaster_key_command = 'kms'", "give one of"),
     ],
 )
 def test_a_wrong_file_is_one_sentence(elsewhere: Path, text: str, sentence: str) -> None:
@@ -186,7 +183,7 @@ def test_every_kind_of_setting_is_read_from_the_environment(
         tls_key="k",
         rate_limit_storage="redis://u:p@h/1",
         retention_days=30,
-        master_key_command="kms read 'a b'",
+        master_key_variable="KEYS",
     )
     for name, value in environment_of(settings).items():
         monkeypatch.setenv(name, value)

@@ -98,7 +98,6 @@ def test_a_master_key_beside_the_database_is_said(tmp_path: Path) -> None:
         Settings(data_dir=data, database_url=f"sqlite:///{elsewhere}/x.db"),
         Settings(data_dir=data, database_url="postgresql://u@127.0.0.1:1/x"),
         Settings(data_dir=data, master_key_variable="KEY"),
-        Settings(data_dir=data, master_key_command="kms"),
     ):
         assert key_beside_database(other) is None
 

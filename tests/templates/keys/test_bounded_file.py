@@ -5,7 +5,7 @@ from typing import BinaryIO
 
 import pytest
 
-from templates.keys.bounded_file import read_at_most
+from templates.keys.private_file import read_at_most
 
 
 class Noting:

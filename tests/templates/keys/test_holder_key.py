@@ -45,7 +45,7 @@ def test_files_that_hold_no_key_are_named_and_not_shown(tmp_path: Path) -> None:
     for content in ("", text[:-1], text + "\n\n", text + "\r\n", f"{text}\n{text}\n", "\udcff"):
         path.write_bytes(content.encode(errors="surrogateescape"))
         path.chmod(0o600)
-        with pytest.raises(SealError, match=r"anna\.key holds no key") as caught:
+        with pytest.raises(SealError, match=r"anna\.key (holds no key|has more than)") as caught:
             read_holder_key(path)
         assert text[:8] not in str(caught.value)
     path.write_text(text)

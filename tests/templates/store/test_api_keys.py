@@ -1,8 +1,10 @@
+import contextlib
 import hashlib
 import hmac
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
+from pathlib import Path
 from unittest import mock
 
 import pytest
@@ -10,7 +12,8 @@ import sqlalchemy as sa
 
 from templates.errors import StoreError
 from templates.keys.sealing import MasterKeyring
-from templates.store import By, NewApiKey, Right, TemplateStore, UnknownTenant
+from templates.store import By, Right, TemplateStore, UnknownTenant
+from templates.store.api_keys import NewApiKey
 from templates.store.database import Database
 from templates.store.schema import ApiKeyRow
 from tests.templates.store.conftest import Clock
@@ -161,6 +164,19 @@ def test_bootstrap_happens_once(database_url: str, keyring: MasterKeyring) -> No
     store.close()
 
 
+def test_an_archive_does_not_let_the_first_key_be_made_again(
+    database_url: str,
+    keyring: MasterKeyring,
+    tmp_path: Path,
+) -> None:
+    with contextlib.closing(TemplateStore(database_url, keyring)) as store:
+        store.upgrade()
+        assert store.api_keys.bootstrap() is not None
+        store.erasures.erase_tenant("default")
+        store.archive_audit_log(tmp_path / "archive", through=None)
+        assert store.api_keys.bootstrap() is None
+
+
 def audit(store: TemplateStore) -> list[tuple[str, str, str | None]]:
     return [(line.action, line.outcome, line.detail) for line in store.audit_log.lines()]
 
@@ -183,7 +199,7 @@ def test_a_replaced_key_works_for_the_grace_only(store: TemplateStore, clock: Cl
     assert audit(store) == [
         ("key-create", "created", old.key.prefix),
         ("key-create", "created", new.key.prefix),
-        ("key-replace", "replaced", old.key.prefix),
+        ("key-replace", "replaced", f"{old.key.prefix} {clock.time.isoformat()}"),
     ]
     assert [line.actor for line in store.audit_log.lines()][1:] == ["operator:kim"] * 2
 

@@ -25,7 +25,7 @@ from templates.keys.rotation import ROTATION_VERSION, SignedCosineRotation, Tena
 from templates.keys.sealing import MasterKeyring
 from templates.space.lifting import Strategy, lift
 from templates.space.subspace import AffineSubspace, SubspaceBatch
-from templates.store import Source, TemplateStore, UnknownTenant
+from templates.store import Attempt, Source, TemplateStore, UnknownTenant
 from templates.store.audit_log import By
 from templates.store.database import Database
 from templates.store.rerotation import _Rotations
@@ -33,7 +33,8 @@ from templates.store.schema import RotationKeyRow, SubjectRow, TemplateRow
 from templates.store.subject_rows import SubjectTemplate
 from templates.store.tenants import RetiredRotation
 from tests.patience import PATIENCE_S
-from tests.templates.store.conftest import Clock, SlowSealing, template_id
+from tests.templates.store.conftest import Clock, SlowSealing
+from tests.templates.store.test_attempts import Says, decide
 from tests.templates.store.test_erasure import found, pieces
 
 N, M = 48, 4
@@ -324,27 +325,27 @@ def test_retiring_drops_the_old_keys_once_nothing_needs_them(store: TemplateStor
 
 
 def test_a_move_has_its_line_and_takes_back_no_decision(store: TemplateStore) -> None:
-    """The template keeps its id, so whoever was compared with it before was compared with it."""
+    """The template keeps its id: a probe that was compared with it before was compared with it."""
     people = People(store, 3)
     for name in people.names:
         people.enroll(name)
-    decided_on = template_id(store, people.names[0])
     store.rerotation.begin("default")
     assert store.rerotation.move("default", binding(), by=OPERATOR) == 3
     assert audit(store)[-1] == ("moved", "default", "operator:kim", "request-1", "epoch 2")
     before = store.audit_log.head()
     assert store.rerotation.move("default", binding(), by=OPERATOR) == 0
     assert store.audit_log.head() == before
-    store.attempts.conclude(
-        "default",
-        people.names[0],
-        accepted=True,
-        template_id=decided_on,
-        level="m",
-        nonce=None,
-        by=OPERATOR,
-    )
-    assert store.audit_log.head().sequence == before.sequence + 1
+    store.rerotation.begin("default")
+    calls: list[int] = []
+
+    def compare(_: Attempt) -> Says:
+        calls.append(store.rerotation.move("default", binding()))
+        return Says(accepted=True)
+
+    assert decide(
+        store, compare, subject=people.names[0], contract_id=binding().contract_id
+    ).accepted
+    assert calls == [3]
 
 
 def test_what_is_left_is_named_in_pages(store: TemplateStore) -> None:
@@ -408,17 +409,17 @@ from templates.store.rerotation import Rerotation
 from tests.templates.store.test_rerotation import binding
 
 url, key_file, place = sys.argv[1:]
-replace_all = Rerotation._replace_all
+replace = Rerotation._replace
 
 def die(*_: object) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
-def die_inside(*arguments: object, **named: object) -> int:
-    replace_all(*arguments, **named)
+def die_inside(*arguments: object) -> None:
+    replace(*arguments)
     die()
 
 if place == "inside":
-    Rerotation._replace_all = die_inside
+    Rerotation._replace = die_inside
 store = TemplateStore(url, MasterKeyring.load(key_file))
 store.rerotation.move("default", binding(), batch=2, progress=die)
 """
@@ -496,7 +497,7 @@ def test_a_key_that_was_wrapped_again_meanwhile_is_not_put_back(
     store.rerotation.begin("default")
     MasterKeyring.add_current(key_file)
     meanwhile(monkeypatch, store.wrapped_keys.rewrap)
-    assert store.rerotation.move("default", binding()) == 3  # looked at again
+    assert store.rerotation.move("default", binding()) == 3
     assert list(store.wrapped_keys.count()) == [MasterKeyring.load(key_file).current]
     assert people.own_distances().max() < 1e-3
 
@@ -530,8 +531,6 @@ def test_an_enrollment_under_way_is_waited_for_before_a_key_goes(
 ) -> None:
     """It read epoch 1 and has not committed: no query can see its template yet."""
     service = TemplateStore(database_url, MasterKeyring.load(key_file))
-    service.signer.pseudonym("default", "-")
-    service.audit_log.prepare()
     people, slow_people = People(store, 1), People(service, 1)
     with ThreadPoolExecutor(2) as threads:
         writing = threads.submit(slow_people.enroll, "s000")

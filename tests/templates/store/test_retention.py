@@ -1,4 +1,3 @@
-import contextlib
 import random
 import threading
 from collections.abc import Callable
@@ -12,32 +11,19 @@ import sqlalchemy as sa
 
 from templates.errors import StoreError
 from templates.keys.sealing import MasterKeyring
-from templates.store import (
-    By,
-    Retention,
-    Superseded,
-    TemplateStore,
-    retention,
-    verify_receipt,
-)
+from templates.store import By, Receipt, Retention, TemplateStore, verify_receipt
 from templates.store.database import Database
+from templates.store.erasure import Erasures
 from templates.store.schema import ReceiptRow, SubjectRow, TemplateRow
-from tests.templates.store.conftest import CONTRACT, Clock, put, template_id
+from tests.templates.store.conftest import CONTRACT, Clock, put
+from tests.templates.store.test_attempts import Says, attempt, decide
 from tests.templates.store.test_erasure import count, found, pieces
 
 DAY = timedelta(days=1)
 
 
-def use(store: TemplateStore, subject_id: str, decided_on: str | None = None) -> None:
-    store.attempts.conclude(
-        "default",
-        subject_id,
-        accepted=True,
-        template_id=decided_on or template_id(store, subject_id),
-        level="m",
-        nonce=None,
-        by=By(),
-    )
+def use(store: TemplateStore, subject_id: str) -> None:
+    assert attempt(store, subject_id, accepted=True) == "accept"
 
 
 def names(store: TemplateStore, tenant: str = "default") -> list[str]:
@@ -157,15 +143,15 @@ def test_many_of_one_moment_are_listed_in_steps(store: TemplateStore, clock: Clo
 
 def after_listing(monkeypatch: pytest.MonkeyPatch, action: Callable[[], object]) -> None:
     """Do something once, when the list of who is due was read and nobody is erased yet."""
-    erase, done = retention.RetentionJob._erase, threading.Event()
+    erase_if, done = Erasures.erase_if, threading.Event()
 
-    def and_then(*arguments: Any) -> bool:
+    def and_then(*arguments: Any, **options: Any) -> Receipt | None:
         if not done.is_set():
             done.set()
             action()
-        return erase(*arguments)
+        return erase_if(*arguments, **options)
 
-    monkeypatch.setattr(retention.RetentionJob, "_erase", and_then)
+    monkeypatch.setattr(Erasures, "erase_if", and_then)
 
 
 @pytest.mark.parametrize("change", ["enrolled again", "used", "erased", "made anew", "gone"])
@@ -190,7 +176,7 @@ def test_who_changed_since_the_list_was_read_is_asked_again(
                 store.erasures.erase("default", "ada")
                 put(store, "ada", b"wire")
             case "gone":
-                store.tenant_erasures.erase(tenant)
+                store.erasures.erase_tenant(tenant)
 
     after_listing(monkeypatch, act)
     assert store.retention.erase_expired(Retention(None, 5 * DAY)) == 1
@@ -203,7 +189,7 @@ def test_who_changed_since_the_list_was_read_is_asked_again(
 def test_of_a_use_and_an_erasure_at_once_one_comes_first(
     store: TemplateStore, database_url: str, key_file: Path, clock: Clock
 ) -> None:
-    """Whoever was told of an accept is still enrolled afterwards, unless it was due again."""
+    """A subject with an accept is still enrolled afterwards."""
     service = TemplateStore(database_url, MasterKeyring.load(key_file), clock=clock)
     people = [f"s{number:02}" for number in range(30)]
     for name in people:
@@ -215,12 +201,8 @@ def test_of_a_use_and_an_erasure_at_once_one_comes_first(
     def verify(mine: list[str]) -> None:
         start.wait()
         for name in mine:
-            found = service.subjects.get("default", name)
-            if found is None:
-                continue
-            # What was found may be gone when it is noted: then nobody is told of an accept.
-            with contextlib.suppress(Superseded):
-                use(service, name, found.record.template_id)
+            # A subject that is gone by the record is decided on again, and rejected.
+            if decide(service, lambda each: Says(each.template is not None), subject=name).accepted:
                 accepted.add(name)
 
     def erase() -> int:
@@ -255,32 +237,6 @@ def test_workers_that_erase_at_once_erase_each_subject_once(
     assert count(store.database, TemplateRow) == 0
     assert store.audit_log.verify().intact
     other.close()
-
-
-def test_the_list_is_read_in_the_order_of_an_index(tmp_path: Path, keyring: MasterKeyring) -> None:
-    """Else each step would read and sort every subject there is."""
-    store = TemplateStore(f"sqlite:///{tmp_path / 'veilface.db'}", keyring)
-    store.upgrade()
-    keep, plans = Retention(DAY, DAY), []
-
-    def explain(connection: sa.Connection) -> None:
-        def note(_: Any, __: Any, statement: str, parameters: Any, *___: Any) -> None:
-            explained = connection.connection.cursor()
-            explained.execute(f"EXPLAIN QUERY PLAN {statement}", parameters)
-            plans.append(" / ".join(row[-1] for row in explained.fetchall()))
-
-        sa.event.listen(connection.engine, "before_cursor_execute", note)
-        now = store._context.clock()
-        for after in (None, (now, "0" * 32)):
-            retention._due(connection, expired=keep.expired(now), after=after, batch=3)
-        sa.event.remove(connection.engine, "before_cursor_execute", note)
-
-    store.database.read(explain)
-    assert len(plans) == 2
-    for plan in plans:
-        assert "SEARCH subjects USING INDEX ix_subjects_updated_at_id" in plan
-        assert "TEMP B-TREE" not in plan
-    store.close()
 
 
 def test_sqlite_files_keep_nothing_of_who_was_erased(

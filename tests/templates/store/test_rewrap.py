@@ -187,4 +187,4 @@ def test_every_wrapped_column_of_the_schema_is_known() -> None:
     }
     known = {(each.table.__tablename__, each.blob.key) for each in WRAPPED_COLUMNS}
     assert known == wrapped
-    assert len(WRAPPED_COLUMNS) == 4
+    assert len(WRAPPED_COLUMNS) == 3

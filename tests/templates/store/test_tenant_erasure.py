@@ -3,7 +3,6 @@ import random
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor, wait
-from datetime import timedelta
 from pathlib import Path
 
 import pytest
@@ -14,7 +13,6 @@ from templates.keys.sealing import MasterKeyring
 from templates.store import (
     By,
     InvalidIdentifier,
-    Nonce,
     Receipt,
     Right,
     TemplateStore,
@@ -22,20 +20,20 @@ from templates.store import (
     verify_receipt,
 )
 from templates.store.database import Database
+from templates.store.erasure import Erasure
 from templates.store.schema import (
     ApiKeyRow,
     Base,
     FailedAttemptsRow,
+    ReceiptRow,
     RotationKeyRow,
     SubjectRow,
     TemplateRow,
-    TenantErasureRow,
     TenantRow,
-    UsedNonceRow,
 )
-from templates.store.tenant_erasure import TenantErasure
 from tests.patience import PATIENCE_S
-from tests.templates.store.conftest import Clock, SlowSealing, compact_until, put, template_id
+from tests.templates.store.conftest import Clock, SlowSealing, compact_until, put
+from tests.templates.store.test_attempts import attempt
 from tests.templates.store.test_erasure import count, found, pieces
 
 OPERATOR = By("operator:kim", "request-1")
@@ -45,8 +43,6 @@ OF_A_TENANT = (
     RotationKeyRow,
     ApiKeyRow,
     FailedAttemptsRow,
-    UsedNonceRow,
-    TenantErasureRow,
     TenantRow,
 )
 
@@ -58,17 +54,7 @@ def fill(store: TemplateStore, tenant: str, *, subjects: int = 5) -> dict[str, i
     for number in range(subjects):
         put(store, f"s{number}", b"wire", tenant=tenant)
     for number in range(subjects + 2):  # two of them are not enrolled
-        store.attempts.conclude(
-            tenant,
-            f"s{number}",
-            accepted=False,
-            template_id=template_id(store, f"s{number}", tenant),
-            level="m",
-            nonce=Nonce(
-                keys[0].prefix, f"nonce {number}", store._context.clock() + timedelta(hours=1)
-            ),
-            by=By(),
-        )
+        assert attempt(store, f"s{number}", tenant=tenant) == "reject"
     store.rerotation.begin(tenant)
     return {
         "subjects": subjects,
@@ -77,7 +63,6 @@ def fill(store: TemplateStore, tenant: str, *, subjects: int = 5) -> dict[str, i
         "rotation_keys": 2,
         "api_keys": 2,
         "failed_attempts": subjects + 2,
-        "nonces": subjects + 2,
     }
 
 
@@ -96,15 +81,12 @@ def nothing_is_left(store: TemplateStore, *, tenants: int) -> bool:
     return held == expected
 
 
-@pytest.mark.parametrize("batch", [2, 200])
 def test_everything_of_the_tenant_goes_and_nothing_of_another(
-    store: TemplateStore, clock: Clock, batch: int
+    store: TemplateStore, clock: Clock
 ) -> None:
     mine, theirs = fill(store, "default"), fill(store, "other", subjects=3)
-    held = store.tenant_erasures.held("default")
-    assert {each["item"]: each["count"] for each in held.items} == mine
     clock.pass_by(hours=1)
-    erasure = store.tenant_erasures.erase("default", by=OPERATOR, batch=batch)
+    erasure = store.erasures.erase_tenant("default", by=OPERATOR)
     assert erasure.erased
     assert erasure.log_purged
     assert counted(erasure.receipt) == mine
@@ -122,88 +104,51 @@ def test_everything_of_the_tenant_goes_and_nothing_of_another(
         RotationKeyRow: theirs["rotation_keys"],
         ApiKeyRow: theirs["api_keys"],
         FailedAttemptsRow: theirs["failed_attempts"],
-        UsedNonceRow: theirs["nonces"],
-        TenantErasureRow: 0,
         TenantRow: 1,
     }
     assert count(store.database, TemplateRow) == theirs["templates"]
-    for call in (store.tenants.get, store.tenant_erasures.held):
-        with pytest.raises(UnknownTenant):
-            call("default")
+    with pytest.raises(UnknownTenant):
+        store.tenants.get("default")
     assert store.subjects.list("default").records == ()
     found = store.subjects.get("other", "s0")
     assert found is not None
-    assert outcomes(store) == ["begun", "erased"]
+    assert outcomes(store) == ["erased"]
     line = list(store.audit_log.lines())[-1]
     assert (line.tenant, line.actor, line.request_id) == ("default", "operator:kim", "request-1")
     assert store.audit_log.verify().intact
 
 
-def test_its_keys_are_revoked_before_anything_goes(store: TemplateStore) -> None:
-    fill(store, "default")
-    token = store.api_keys.create("default", [Right.ENROLL]).token
-    seen: list[bool] = []
-
-    def look(removed: int) -> None:
-        assert store.api_keys.verify(token) is None
-        key = store.api_keys.get(token.split("_")[1])
-        seen.append(key is not None and key.revoked_at is not None)
-
-    store.tenant_erasures.erase("default", progress=look)
-    assert seen
-    assert all(seen)
-    assert store.api_keys.verify(token) is None
-
-
 def test_erasing_again_gives_the_same_receipt(store: TemplateStore, clock: Clock) -> None:
     fill(store, "default")
-    first = store.tenant_erasures.erase("default")
+    first = store.erasures.erase_tenant("default")
     clock.pass_by(days=1)
-    again = store.tenant_erasures.erase("default")
+    again = store.erasures.erase_tenant("default")
     assert not again.erased
-    assert again.receipt == first.receipt == store.tenant_erasures.receipt("default")
-    assert outcomes(store) == ["begun", "erased", "receipt_repeated"]
+    assert again.receipt == first.receipt
+    assert outcomes(store) == ["erased", "receipt_repeated"]
 
 
 def test_a_tenant_that_never_was_is_unknown(store: TemplateStore) -> None:
     put(store, "ada", b"wire")
     store.erasures.erase("default", "ada")
     with pytest.raises(UnknownTenant, match="'nobody'"):
-        store.tenant_erasures.erase("nobody")
+        store.erasures.erase_tenant("nobody")
     with pytest.raises(InvalidIdentifier):
-        store.tenant_erasures.erase("no/body")
-    assert store.tenant_erasures.receipt("default") is None
+        store.erasures.erase_tenant("no/body")
     assert outcomes(store) == []
-
-
-def test_an_interrupted_erasure_is_finished_and_counts_everything(store: TemplateStore) -> None:
-    everything = fill(store, "default")
-
-    def stop(removed: int) -> None:
-        raise KeyboardInterrupt
-
-    for _ in range(2):
-        with pytest.raises(KeyboardInterrupt):
-            store.tenant_erasures.erase("default", batch=2, progress=stop)
-    assert count(store.database, SubjectRow) == 1
-    assert count(store.database, TemplateRow) == 1
-    erasure = store.tenant_erasures.erase("default", batch=2)
-    assert counted(erasure.receipt) == everything
-    assert outcomes(store) == ["begun", "resumed", "resumed", "erased"]
-    assert nothing_is_left(store, tenants=1)
 
 
 def test_a_tenant_made_anew_has_another_rotation_and_another_epoch(store: TemplateStore) -> None:
     """So a process that keeps rotations by name and epoch never uses the old one for it."""
     store.rerotation.begin("default")
     old = {epoch: store.tenants.rotation_key("default", epoch=epoch).key for epoch in (1, 2)}
-    first = store.tenant_erasures.erase("default")
+    first = store.erasures.erase_tenant("default")
     assert first.receipt.claims["rotation_epoch"] == 2
     tenant = store.tenants.create("default")
     assert tenant.rotation_epoch == 3
     assert store.tenants.rotation_key("default").key not in old.values()
     put(store, "ada", b"wire")
-    second = store.tenant_erasures.erase("default")
+    second = store.erasures.erase_tenant("default")
     assert second.erased
     assert second.receipt != first.receipt
     assert counted(second.receipt)["subjects"] == 1
@@ -211,8 +156,17 @@ def test_a_tenant_made_anew_has_another_rotation_and_another_epoch(store: Templa
     assert store.tenants.create("fresh").rotation_epoch == 1
 
 
+def test_a_forged_receipt_sets_no_epoch(store: TemplateStore) -> None:
+    """Else a database writer would bring a new tenant into an epoch whose key they know."""
+    store.erasures.erase_tenant("default")
+    forged = sa.func.replace(ReceiptRow.body, '"rotation_epoch":1', '"rotation_epoch":7')
+    store.database.write(lambda each: each.execute(sa.update(ReceiptRow).values(body=forged)))
+    with pytest.raises(StoreError, match="signature"):
+        store.tenants.create("default")
+
+
 def test_a_receipt_of_a_tenant_survives_json_and_shows_alteration(store: TemplateStore) -> None:
-    receipt = store.tenant_erasures.erase("default").receipt
+    receipt = store.erasures.erase_tenant("default").receipt
     key = store.signer.public_key()
     assert Receipt.from_json(json.loads(json.dumps(receipt.to_json()))) == receipt
     altered = Receipt(receipt.body.replace("default", "defaulT"), receipt.signature)
@@ -222,7 +176,7 @@ def test_a_receipt_of_a_tenant_survives_json_and_shows_alteration(store: Templat
 
 def test_no_second_bootstrap_key_after_the_only_tenant_is_erased(store: TemplateStore) -> None:
     assert store.api_keys.bootstrap() is not None
-    store.tenant_erasures.erase("default")
+    store.erasures.erase_tenant("default")
     assert count(store.database, ApiKeyRow) == 0
     assert store.api_keys.bootstrap() is None
 
@@ -249,16 +203,7 @@ def test_concurrent_enrollments_leave_nothing(
                     case 0:
                         service.erasures.erase("default", name)
                     case 1:
-                        service.attempts.conclude(
-                            "default",
-                            name,
-                            accepted=False,
-                            template_id=None,
-                            contract_id="of another one",
-                            level="m",
-                            nonce=None,
-                            by=By(),
-                        )
+                        attempt(service, name, contract_id="d" * 64)
                     case 2:
                         put(service, name, b"wire")
                         acknowledged.append(name)
@@ -273,7 +218,7 @@ def test_concurrent_enrollments_leave_nothing(
     for thread in threads:
         thread.start()
     ready.wait()
-    erasure = store.tenant_erasures.erase("default", batch=3)
+    erasure = store.erasures.erase_tenant("default")
     done.set()
     for thread in threads:
         thread.join()
@@ -298,12 +243,10 @@ def test_an_enrollment_under_way_goes_with_the_tenant(
 ) -> None:
     """It found the tenant, and has not committed: no query can see it yet."""
     service = TemplateStore(database_url, MasterKeyring.load(key_file))
-    service.signer.pseudonym("default", "-")
-    service.audit_log.prepare()
     with ThreadPoolExecutor(2) as threads:
         writing = threads.submit(put, service, "ada", b"wire")
         assert slow_sealing.sealed.wait(PATIENCE_S)
-        erasing = threads.submit(store.tenant_erasures.erase, "default")
+        erasing = threads.submit(store.erasures.erase_tenant, "default")
         early = wait([erasing], timeout=0.5).done
         slow_sealing.go_on.set()
         assert writing.result().created
@@ -321,9 +264,9 @@ def test_of_two_that_erase_at_once_one_does(
     everything = fill(store, "default", subjects=12)
     start = threading.Barrier(4)
 
-    def erase(each: TemplateStore) -> TenantErasure:
+    def erase(each: TemplateStore) -> Erasure:
         start.wait()
-        return each.tenant_erasures.erase("default", batch=2)
+        return each.erasures.erase_tenant("default")
 
     with ThreadPoolExecutor(4) as threads:
         running = [threads.submit(erase, each) for each in (store, other, store, other)]
@@ -352,7 +295,7 @@ def test_every_table_of_a_tenant_is_known() -> None:
     columns = {
         table.name
         for table in Base.metadata.tables.values()
-        if any(column.name in ("tenant_id", "subject_pk", "api_key_id") for column in table.columns)
+        if any(column.name in ("tenant_id", "subject_pk") for column in table.columns)
     }
     assert columns == of_tenant - {"tenants"}
 
@@ -392,7 +335,7 @@ def test_sqlite_files_keep_nothing_of_an_erased_tenant(
     wanted += [f"subject-{number:04}".encode() for number in range(12)]
     wanted.append(key.label.encode())
     assert max(found(folder, wanted).values()) >= 0.9 * len(wanted)
-    assert store.tenant_erasures.erase("default", batch=5).log_purged
+    assert store.erasures.erase_tenant("default").log_purged
     assert found(folder, wanted) == {}
     assert (folder / "veilface.db-wal").stat().st_size == 0
     assert store.subjects.get("other", "their-subject") is not None
@@ -408,14 +351,13 @@ def test_postgresql_keeps_no_row_after_compacting(
     store.upgrade()
     store.tenants.create("default")
     fill(store, "default")
-    tables = ["subjects", "templates", "rotation_keys", "api_keys", "used_nonces"]
-    tables.append("failed_attempts")
+    tables = ["subjects", "templates", "rotation_keys", "api_keys", "failed_attempts"]
 
     def sizes(connection: sa.Connection) -> list[int]:
         query = sa.select(*(sa.func.pg_relation_size(table) for table in tables))
         return list(connection.execute(query).one())
 
-    store.tenant_erasures.erase("default")
+    store.erasures.erase_tenant("default")
     assert min(store.database.read(sizes)) > 0
     compact_until(store, lambda: set(store.database.read(sizes)) == {0})
     store.close()

@@ -1,7 +1,7 @@
 import pytest
 
 from templates.store import InvalidIdentifier, TemplateStore, UnknownTenant
-from templates.store.secret import SecretName
+from templates.store.secrets import SecretName
 
 
 def test_a_tenant_is_made_once(store: TemplateStore) -> None:
@@ -33,10 +33,10 @@ def test_each_tenant_has_a_rotation_key_of_its_own(store: TemplateStore) -> None
 
 def test_secrets_are_made_once_and_differ_by_name(store: TemplateStore) -> None:
     secrets = [store.secrets.get(name) for name in SecretName]
-    assert [len(secret.value) for secret in secrets] == [32] * len(SecretName)
-    assert len({secret.value for secret in secrets}) == len(SecretName)
+    assert [len(secret) for secret in secrets] == [32] * len(SecretName)
+    assert len(set(secrets)) == len(SecretName)
     assert secrets == [store.secrets.get(name) for name in SecretName]
-    assert not any(secret.value.hex() in repr((store.secrets, secrets)) for secret in secrets)
+    assert not any(secret.hex() in repr(store.secrets) for secret in secrets)
 
 
 def test_enrollment_by_template_is_off_until_it_is_allowed(store: TemplateStore) -> None:

@@ -1,0 +1,185 @@
+"""Moving old lines of the audit log into a file, so that the log does not grow for ever.
+
+An archive is a file of JSON lines: first a signed head, then the audit lines as they were stored::
+
+    {"body": "<canonical JSON>", "signature": "<base64, Ed25519 over the UTF-8 bytes of body>"}
+    {"sequence": 1, "at": "…", …, "mac": "<hex>"}
+
+The body names the anchors between which the lines lie, and the SHA-256 of everything after the
+first line. So anybody who has the public key of the deployment's receipts can check an archive, and
+the anchors of one archive after another, and of the log, show that none is missing.
+"""
+
+import base64
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, timedelta
+from pathlib import Path
+from typing import Any
+
+import sqlalchemy as sa
+from cryptography.exceptions import InvalidSignature
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
+from sqlalchemy.engine import Connection
+
+from templates.contract.canonical import canonical_json
+from templates.errors import StoreError
+from templates.keys.private_file import create_private
+from templates.store.audit_log import (
+    LINES,
+    MOVE_HEAD,
+    Anchor,
+    BrokenAuditLog,
+    By,
+    Entry,
+    Head,
+    head_columns,
+    line_break,
+    read_head,
+)
+from templates.store.context import StoreContext
+from templates.store.schema import AuditRow
+from templates.store.secrets import SecretName
+
+KIND = "veilface-audit-archive"
+TOKENS_LAST = timedelta(minutes=10)
+"""Longer than any one-use token is good for: until then, the line of its use stays in the log."""
+
+
+@dataclass(frozen=True)
+class Archive:
+    """A piece of the audit log in a file: the lines after `base` up to `last`."""
+
+    base: Anchor
+    last: Anchor
+    lines: int
+
+
+def archive_lines(context: StoreContext, file: Path, *, through: int | None, by: By) -> Archive:
+    """Verify the lines up to a number, write them to a new file, and remove them from the log.
+
+    In one write, for which every other one waits. The file is complete on disk before the lines
+    go; where the write fails afterwards, they are in both.
+
+    The archive ends before the first line that used up a token which may still be in time: without
+    that line, the token would be good once more.
+
+    Parameters
+    ----------
+    file
+        A new file, which gets mode 0600.
+    through
+        Number of the last line to go; None for all that may.
+    by
+        Who asks: the log gets a line of it.
+
+    Raises
+    ------
+    BrokenAuditLog
+        If the chain breaks among these lines. Nothing is written or removed.
+    StoreError
+        If there are none, or the file exists or cannot be written.
+    """
+
+    def work(connection: Connection) -> Archive:
+        end = _last_to_go(connection, context, through)
+        archive = write_archive(connection, context, file, end)
+        detail = f"{archive.base.sequence + 1}-{archive.last.sequence}"
+        context.audit_log.append(connection, Entry("audit-archive", "archived", by, detail=detail))
+        return archive
+
+    archive = context.database.write(work)
+    context.database.purge_log()
+    return archive
+
+
+def _last_to_go(connection: Connection, context: StoreContext, through: int | None) -> int | None:
+    used_since = (context.clock() - TOKENS_LAST).astimezone(UTC).isoformat(timespec="microseconds")
+    first_use: int | None = connection.execute(
+        sa.select(sa.func.min(AuditRow.sequence)).where(
+            AuditRow.token.is_not(None), AuditRow.at > used_since
+        )
+    ).scalar()
+    if first_use is None:
+        return through
+    return first_use - 1 if through is None else min(through, first_use - 1)
+
+
+def write_archive(
+    connection: Connection, context: StoreContext, file: Path, through: int | None
+) -> Archive:
+    """:func:`archive_lines` inside a write, without the line that tells of it."""
+    key = context.audit_log.key
+    head = read_head(connection, key)
+    end = head.last.sequence if through is None else min(through, head.last.sequence)
+    query = LINES.where(AuditRow.sequence <= end).order_by(AuditRow.sequence)
+    last, texts = head.base, []
+    for row in connection.execute(query):
+        values: dict[str, Any] = row._asdict()
+        if what := line_break(key, values, last):
+            raise BrokenAuditLog(
+                f"line {values['sequence']} of the audit log is {what}, and nothing was archived: "
+                "run `veilface audit-log verify`"
+            )
+        texts.append(json.dumps({**values, "mac": values["mac"].hex()}))
+        last = Anchor(values["sequence"], values["mac"])
+    if not texts:
+        raise StoreError(
+            "the audit log holds no line up to this number that may go; nothing was archived"
+        )
+    body = "".join(f"{text}\n" for text in texts).encode()
+    claims: dict[str, Any] = {
+        "kind": KIND,
+        "base": str(head.base),
+        "last": str(last),
+        "lines": len(texts),
+        "sha256": hashlib.sha256(body).hexdigest(),
+    }
+    private = Ed25519PrivateKey.from_private_bytes(context.secrets.get(SecretName.RECEIPT))
+    signed = canonical_json(claims)
+    first = {"body": signed.decode(), "signature": _text(private.sign(signed))}
+    try:
+        create_private(file, json.dumps(first).encode() + b"\n" + body)
+    except OSError as error:
+        raise StoreError(f"the archive {file} cannot be written: {error.strerror}") from None
+    connection.execute(sa.delete(AuditRow).where(AuditRow.sequence <= last.sequence))
+    connection.execute(MOVE_HEAD, head_columns(Head(last, head.last), key))
+    return Archive(head.base, last, len(texts))
+
+
+def verify_archive(file: Path, public_key: bytes) -> Archive:
+    """Check the signature of an archive, and that its lines are the signed ones.
+
+    Parameters
+    ----------
+    public_key
+        The 32 bytes that verify the deployment's receipts.
+
+    Raises
+    ------
+    StoreError
+        If the file cannot be read, was altered, or is another deployment's.
+    """
+    try:
+        first, _, lines = file.read_bytes().partition(b"\n")
+        signed: Mapping[str, str] = json.loads(first)
+        body = signed["body"].encode()
+        signature = base64.b64decode(signed["signature"], validate=True)
+        Ed25519PublicKey.from_public_bytes(public_key).verify(signature, body)
+        claims = json.loads(body)
+        if claims["kind"] != KIND or hashlib.sha256(lines).hexdigest() != claims["sha256"]:
+            raise ValueError
+        base, last = Anchor.parse(claims["base"]), Anchor.parse(claims["last"])
+    except OSError as error:
+        raise StoreError(f"the archive {file} cannot be read: {error.strerror}") from None
+    except (InvalidSignature, ValueError, KeyError, TypeError, AttributeError):
+        raise StoreError(
+            f"{file} is no archive of this deployment's audit log, or was altered"
+        ) from None
+    return Archive(base, last, claims["lines"])
+
+
+def _text(data: bytes) -> str:
+    return base64.b64encode(data).decode()

@@ -1,0 +1,100 @@
+"""Secrets of the whole deployment: drawn once, wrapped by the master key, the same everywhere."""
+
+import os
+from enum import StrEnum
+from typing import Any
+
+import sqlalchemy as sa
+from sqlalchemy.engine import Connection
+
+from templates.errors import SealError, StoreError
+from templates.keys.sealing import MasterKeyring, sealed_key_id
+from templates.store.database import Database
+from templates.store.identifiers import Clock
+from templates.store.schema import SecretRow
+
+SECRET_PURPOSE = "store-secret"  # noqa: S105 - a label, not a secret
+SECRET_BYTES = 32
+
+
+class SecretName(StrEnum):
+    """Every secret of a deployment; each is 32 random bytes."""
+
+    CHAIN = "audit-chain"
+    PSEUDONYM = "pseudonym"
+    RECEIPT = "receipt-signing"
+    EXPORT = "export"
+    LIFTS = "lifts"
+    API_KEYS = "api-keys"
+
+
+class Secrets:
+    """The secrets of a deployment, opened at the first use and kept in memory.
+
+    Parameters
+    ----------
+    database, keyring, clock
+        Where they are kept, what wraps them, and what time it is.
+    """
+
+    def __init__(self, database: Database, keyring: MasterKeyring, clock: Clock) -> None:
+        self._database = database
+        self._keyring = keyring
+        self._clock = clock
+        self._opened: dict[str, bytes] = {}
+
+    def get(self, name: SecretName) -> bytes:
+        """Return a secret.
+
+        Raises
+        ------
+        StoreError
+            If the database has none of this name.
+        SealError
+            If it was wrapped by another master key.
+        """
+        if name not in self._opened:
+            self.load()
+        if name not in self._opened:
+            raise StoreError(
+                f"the database has no secret {name!r}: run `veilface db upgrade` on a new "
+                "database, and restore any other from a backup"
+            )
+        return self._opened[name]
+
+    def load(self) -> None:
+        """Read and open all secrets; :class:`SealError` under another master key."""
+        query = sa.select(SecretRow.name, SecretRow.wrapped_value)
+        rows = self._database.read(lambda connection: connection.execute(query).all())
+        try:
+            self._opened = {name: self.opened(name, sealed) for name, sealed in rows}
+        except SealError as error:
+            raise SealError(f"this is not the master key of this database: {error}") from None
+
+    def opened(self, name: str, sealed: bytes) -> bytes:
+        """Open the stored value of a secret."""
+        return self._keyring.open(sealed, purpose=SECRET_PURPOSE, bound_to=[name])
+
+    def make_missing(self, connection: Connection) -> set[SecretName]:
+        """Draw the secrets that the database lacks, in a write; returns which."""
+        present = set(connection.execute(sa.select(SecretRow.name)).scalars())
+        missing = {name for name in SecretName if name not in present}
+        for name in missing:
+            row = {"name": name, "created_at": self._clock(), **self._drawn(name)}
+            connection.execute(sa.insert(SecretRow).values(row))
+        return missing
+
+    def renew(self, connection: Connection, name: SecretName) -> bytes:
+        """Draw a secret anew, in a write; every process reads it when it starts again."""
+        values = self._drawn(name)
+        connection.execute(sa.update(SecretRow).where(SecretRow.name == name).values(values))
+        return self.opened(name, values["wrapped_value"])
+
+    def _drawn(self, name: SecretName) -> dict[str, Any]:
+        sealed = self._keyring.seal(
+            os.urandom(SECRET_BYTES), purpose=SECRET_PURPOSE, bound_to=[name]
+        )
+        return {"wrapped_value": sealed, "wrapping_key": sealed_key_id(sealed)}
+
+    def __repr__(self) -> str:
+        return "Secrets()"

@@ -1,0 +1,162 @@
+"""What an attacker who writes the database, but has no master key, can and cannot do.
+
+They cannot make or widen an API key: such a row is as good as none. They can put an earlier row
+back, and the service takes it: the verification of the audit log reports it.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import sqlalchemy as sa
+from sqlalchemy.engine import Connection
+
+from templates.store import TemplateStore
+from templates.store.evidence import COUNT_LIFTED, KEY_ALTERED, KEY_PUT_BACK
+from tests.templates.store.conftest import Clock, put
+from tests.templates.store.test_attempts import attempt
+
+
+def write(store: TemplateStore, *statements: str, **values: object) -> None:
+    def work(connection: Connection) -> None:
+        for statement in statements:
+            connection.execute(sa.text(statement), values)
+
+    store.database.write(work)
+
+
+def reported(store: TemplateStore) -> list[tuple[str, str]]:
+    verification, records = store.verify_audit_log()
+    assert verification.intact
+    return [(record.what, record.about) for record in records]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        "rights = 'admin,enroll,verify'",
+        "expires_at = NULL",
+        "expires_at = '2099-01-01 00:00:00'",
+        "lowest_level = NULL",
+        "token_hash = (SELECT token_hash FROM api_keys WHERE prefix <> :prefix)",
+        "prefix = '000000000000'",
+        "id = '00000000000000000000000000000000'",
+        "tenant_id = (SELECT id FROM tenants WHERE name = 'other')",
+        "revoked_at = '2026-03-01 00:00:00'",
+        "mac = (SELECT mac FROM api_keys WHERE prefix <> :prefix)",
+    ],
+)
+def test_a_key_is_not_widened(store: TemplateStore, clock: Clock, change: str) -> None:
+    clock.pass_by(days=1)
+    made = store.api_keys.create(
+        "default", ["verify"], expires_at=clock.time.replace(year=2027), lowest_level="fmr-1e-4"
+    )
+    other = store.api_keys.create("default", ["admin"])
+    assert store.api_keys.verify(made.token) is not None
+    write(store, f"UPDATE api_keys SET {change} WHERE prefix = :prefix", prefix=made.key.prefix)
+    assert store.api_keys.verify(made.token) is None
+    assert store.api_keys.verify(other.token) is not None
+    ((what, _),) = reported(store)
+    assert what == KEY_ALTERED
+
+
+def test_a_tenants_new_name_gives_its_keys_no_other_tenant(store: TemplateStore) -> None:
+    made = store.api_keys.create("other", ["verify"])
+    write(
+        store,
+        "UPDATE tenants SET name = 'elsewhere' WHERE name = 'default'",
+        "UPDATE tenants SET name = 'default' WHERE name = 'other'",
+    )
+    assert store.api_keys.verify(made.token) is None
+
+
+def test_a_key_is_not_made_up(store: TemplateStore) -> None:
+    made = store.api_keys.create("default", ["verify"])
+    columns = "tenant_id, token_hash, rights, label, created_at, mac"
+    write(
+        store,
+        f"INSERT INTO api_keys (id, prefix, {columns}) "
+        f"SELECT 'f', 'aaaaaaaaaaaa', {columns} FROM api_keys",
+    )
+    token = made.token.replace(made.key.prefix, "aaaaaaaaaaaa")
+    assert store.api_keys.verify(token) is None
+    assert reported(store) == [(KEY_ALTERED, "key:aaaaaaaaaaaa")]
+
+
+KEEP = "CREATE TABLE kept AS SELECT * FROM {0}"
+PUT_BACK = ("DELETE FROM {0}", "INSERT INTO {0} SELECT * FROM kept", "DROP TABLE kept")
+
+
+def put_back(store: TemplateStore, table: str, meanwhile: Callable[[], object]) -> None:
+    """Bring a table back to the state in which it was before something happened."""
+    write(store, KEEP.format(table))
+    meanwhile()
+    write(store, *(statement.format(table) for statement in PUT_BACK))
+
+
+def test_a_revocation_that_was_undone_is_reported(store: TemplateStore) -> None:
+    made = store.api_keys.create("default", ["verify"])
+    put_back(store, "api_keys", lambda: store.api_keys.revoke(made.key.prefix))
+    assert store.api_keys.verify(made.token) is not None  # what the threat model says
+    assert reported(store) == [(KEY_PUT_BACK, f"key:{made.key.prefix}")]
+    store.api_keys.revoke(made.key.prefix)
+    assert reported(store) == []
+
+
+def test_a_key_of_an_erased_tenant_that_was_put_back_is_reported(store: TemplateStore) -> None:
+    made = store.api_keys.create("other", ["verify"])
+    write(store, KEEP.format("tenants"), "CREATE TABLE keys_kept AS SELECT * FROM api_keys")
+    store.erasures.erase_tenant("other")
+    write(
+        store,
+        "INSERT INTO tenants SELECT * FROM kept WHERE name = 'other'",
+        "INSERT INTO api_keys SELECT * FROM keys_kept",
+    )
+    assert reported(store) == [(KEY_PUT_BACK, f"key:{made.key.prefix}")]
+
+
+@pytest.mark.parametrize("enrolled", [True, False])
+def test_a_lock_that_was_lifted_is_reported(store: TemplateStore, enrolled: bool) -> None:
+    if enrolled:
+        put(store, "ada", b"wire")
+    for _ in range(5):
+        attempt(store)
+    assert attempt(store) == "locked 30"
+    assert reported(store) == []
+    write(store, "UPDATE failed_attempts SET consecutive = 4, locked_until = NULL")
+    assert attempt(store) == "reject"
+    assert reported(store) == [(COUNT_LIFTED, store.signer.pseudonym("default", "ada"))]
+    write(store, "DELETE FROM failed_attempts")
+    assert reported(store) == [(COUNT_LIFTED, store.signer.pseudonym("default", "ada"))]
+
+
+def test_what_ends_a_count_rightly_is_not_reported(store: TemplateStore, clock: Clock) -> None:
+    for name in ("ada", "eve", "kim"):
+        put(store, name, b"wire")
+    store.tenants.create("third")
+    for _ in range(3):
+        for name in ("ada", "eve", "kim", "late"):
+            attempt(store, name)
+        attempt(store, "ada", tenant="third")
+    attempt(store, "ada", accepted=True)
+    store.erasures.erase("default", "eve")
+    store.erasures.erase_tenant("third")
+    assert reported(store) == []
+    attempt(store, "ada")
+    clock.pass_by(days=91)
+    store.purge()
+    assert reported(store) == []
+
+
+def test_what_an_archive_tells_is_not_looked_at(store: TemplateStore, tmp_path: Path) -> None:
+    made = store.api_keys.create("default", ["verify"])
+    put_back(store, "api_keys", lambda: store.api_keys.revoke(made.key.prefix))
+    store.archive_audit_log(tmp_path / "audit.jsonl", through=None)
+    assert reported(store) == []
+
+
+def test_rows_are_looked_at_only_where_the_log_is_whole(store: TemplateStore) -> None:
+    attempt(store)
+    write(store, "DELETE FROM failed_attempts", "UPDATE audit_log SET detail = 'low'")
+    verification, records = store.verify_audit_log()
+    assert (verification.intact, records) == (False, ())
