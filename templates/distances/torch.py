@@ -162,36 +162,45 @@ def _schur(block: Tensor, gaps: Tensor) -> Tensor:
 
 
 def _gains(block: Tensor, steps: int) -> Tensor:
-    """Maximise g·u + h·v + uᵀBv from two starts, as ``exact.maximise``, all pairs in step."""
-    g, h, b = block[:, None, 1:, 0], block[:, None, 0, 1:], block[:, 1:, 1:].contiguous()
-    power = b.mT @ b
+    """Maximise F(v), as ``exact.maximise`` from its two starts; pairs at rest make room."""
+    g, b = block[:, None, 1:, 0], block[:, 1:, 1:]
+    if b.shape[1] < b.shape[2]:  # G is the smaller one
+        return _gains(block.mT, steps)
+    gram, c, h, g2 = b.mT @ b, g @ b, block[:, None, 0, 1:], g.square().sum(2)
+    power = gram
     for _ in range(5):
         power = power / power.diagonal(dim1=1, dim2=2).sum(1).clamp(min=_TINY)[:, None, None]
         power = power @ power
     largest = power.diagonal(dim1=1, dim2=2).argmax(dim=1)
     leading = _normalised(power[torch.arange(len(power), device=power.device), :, largest])
     v = torch.stack([leading, -leading], dim=1)
-    value = torch.full_like(v[..., :1], -4)
+    values = torch.full_like(v[..., 0], -4)
+    active, value = torch.arange(len(v), device=v.device), values
     moved = stepped = torch.zeros_like(v)
     for taken in range(steps):
-        u = v @ b.mT + g
-        following = _normalised(_normalised(u) @ b + h)
-        new = u.norm(dim=2, keepdim=True) + (v * h).sum(dim=2, keepdim=True)
+        turned = v @ gram
+        lengths = (g2 + (v * (turned + 2 * c)).sum(2)).clamp(min=_TINY).sqrt()
+        following = _normalised(h + (turned + c) / lengths[..., None])
+        new = lengths + (v * h).sum(2)
         # Where the extrapolated point is worse than the last one, the plain step comes next.
         worse = new < value - 1e-6
         motion = following - v
         turn = motion - moved
-        slope = (motion * turn).sum(2, keepdim=True)
-        slope = slope / turn.square().sum(2, keepdim=True).clamp(min=_TINY)
-        slope = slope.clamp(-LONGEST, LONGEST) if taken else torch.zeros_like(slope)
-        value = torch.where(worse, value, new)
+        slope = (motion * turn).sum(2) / turn.square().sum(2).clamp(min=_TINY)
+        slope = slope.clamp(-LONGEST, LONGEST)[..., None] * (taken > 0)
+        value, again = torch.where(worse, value, new), worse[..., None]
         trial = following - slope * (following - stepped)
-        v = _normalised(torch.where(worse, stepped, trial))
-        moved, stepped = torch.where(worse, moved, motion), torch.where(worse, stepped, following)
-        resting = ~worse[..., 0] & (motion.square().sum(2) < STILL**2)
-        if taken % 8 == 7 and bool(resting.all()):
-            break
-    return value.amax(dim=(1, 2))
+        v = _normalised(torch.where(again, stepped, trial))
+        moved, stepped = torch.where(again, moved, motion), torch.where(again, stepped, following)
+        if taken % 4 == 3 or taken == steps - 1:
+            values[active] = value
+            left = (worse | (motion.square().sum(2) >= STILL**2)).any(dim=1).nonzero()[:, 0]
+            active = active[left]
+            v, value, moved, stepped = (part[left] for part in (v, value, moved, stepped))
+            gram, c, h, g2 = (part[left] for part in (gram, c, h, g2))
+            if not len(active):
+                break
+    return values.amax(dim=1)
 
 
 def _normalised(rows: Tensor) -> Tensor:
