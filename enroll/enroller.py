@@ -29,7 +29,7 @@ from templates.keys.rotation import HolderKey, TenantRotation, holder_rotation
 from templates.space.agreement import distinct_rows, mean_embedding
 from templates.space.embedding import unit_rows
 from templates.space.lifting import Strategy, lift, lift_stream
-from templates.space.subspace import AffineSubspace, SubspaceBatch
+from templates.space.subspace import SubspaceBatch
 
 MAX_PHOTOS = 10
 WIRE_DTYPE: wire.WireDtype = "float16"
@@ -258,7 +258,7 @@ class Enroller:
             Where the template belongs to another contract.
         """
         contract, subspace = self._contract, self._received(data)
-        near = float(self._nobody.stranger_similarity(SubspaceBatch.of([subspace]))[0])
+        near = float(self._nobody.stranger_similarity(subspace)[0])
         # NaN is not below the limit either.
         if not near <= contract.template_stranger_similarity:
             raise InvalidTemplate(
@@ -281,7 +281,7 @@ class Enroller:
         """
         return self._of(self._received(data), holder_salt=holder_salt)
 
-    def _received(self, data: bytes) -> AffineSubspace:
+    def _received(self, data: bytes) -> SubspaceBatch:
         """Decode a template, and check whether it is one of the contract."""
         binding = self._contract.binding
         received = wire.decode(data)
@@ -300,16 +300,16 @@ class Enroller:
             )
         return subspace
 
-    def _of(self, subspace: AffineSubspace, *, holder_salt: str | None) -> Enrollment:
+    def _of(self, subspace: SubspaceBatch, *, holder_salt: str | None) -> Enrollment:
         # The client knows its rows. Turned as they are, they would be pairs (x, R x) of the
         # template's rotation for whoever sees them stored; of a fresh basis only the set is known.
         with Keystream.fresh() as stream:
-            spanned = AffineSubspace.through(subspace.foot, subspace.basis, stream=stream)
+            spanned = SubspaceBatch.through(subspace.foot, subspace.basis, stream=stream)
         return self._finish(spanned, per_photo=(), photos=0, holder_salt=holder_salt)
 
     def _turned_by_holder(
-        self, subspace: AffineSubspace, holder: Holder | None
-    ) -> tuple[AffineSubspace, str | None]:
+        self, subspace: SubspaceBatch, holder: Holder | None
+    ) -> tuple[SubspaceBatch, str | None]:
         """Turn a template by a new rotation of its holder's; returns it with the salt."""
         if holder is None:
             return subspace, None
@@ -319,7 +319,7 @@ class Enroller:
 
     def _finish(
         self,
-        subspace: AffineSubspace,
+        subspace: SubspaceBatch,
         *,
         per_photo: tuple[PhotoResult, ...],
         photos: int,

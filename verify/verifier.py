@@ -20,7 +20,7 @@ from templates.keys.randomness import KEY_BYTES
 from templates.keys.rotation import HolderKey, TenantRotation, holder_rotation
 from templates.space.agreement import mean_embedding
 from templates.space.embedding import unit_rows
-from templates.space.subspace import AffineSubspace, SubspaceBatch, Turn
+from templates.space.subspace import SubspaceBatch, Turn
 from verify.challenge import Movement
 from verify.cohort import Probes, expected_similarity
 from verify.decision import Decision
@@ -232,12 +232,12 @@ class Verifier:
         calibration = self._contract.calibration("s2s", probe_m=subspace.m)
         rule = _Rule(calibration, calibration.level(level or self._contract.default_level))
         self._require_honest_foot(subspace, calibration)
-        lifted = SubspaceBatch.of([subspace])
+        lifted = subspace
         template, turn = self._opened(stored, holder_key, read=wire.decode)
         turned = lifted.turned_by(turn)
         return self._decide(rule, lifted, turned, template, stored, has_key=holder_key is not None)
 
-    def _require_honest_foot(self, subspace: AffineSubspace, calibration: Calibration) -> None:
+    def _require_honest_foot(self, subspace: SubspaceBatch, calibration: Calibration) -> None:
         if calibration.foot_point_norm is None:
             raise InvalidTemplate("this calibration takes no lifted probes")
         low, high = calibration.foot_point_norm
@@ -271,7 +271,7 @@ class Verifier:
             turned = by_holder.turned(points)
             return by_tenant.turned(turned if needs_key else points)
 
-        return SubspaceBatch.of([subspace]), turn
+        return subspace, turn
 
     def _decide(
         self,

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from templates.space.subspace import AffineSubspace
+from templates.space.subspace import SubspaceBatch
 
 Array = NDArray[np.float64]
 
@@ -21,7 +21,7 @@ class Wolf:
     """A lifted probe that is built to lie near everybody."""
 
     family: str
-    subspace: AffineSubspace
+    subspace: SubspaceBatch
 
 
 def axis_wolves(faces: NDArray[np.float32], m: int, *, foot_norm: float, seed: int) -> list[Wolf]:
@@ -57,10 +57,10 @@ def axis_wolves(faces: NDArray[np.float32], m: int, *, foot_norm: float, seed: i
     return wolves
 
 
-def canonical(foot: Array, basis: Array) -> AffineSubspace:
+def canonical(foot: Array, basis: Array) -> SubspaceBatch:
     """Orthonormalise a basis (m, n), and make the foot point (n,) orthogonal to it."""
     orthonormal = np.linalg.qr(basis.T)[0].T
-    return AffineSubspace(
-        foot=(foot - orthonormal.T @ (orthonormal @ foot)).astype(np.float32),
-        basis=np.ascontiguousarray(orthonormal, dtype=np.float32),
+    return SubspaceBatch(
+        feet=(foot - orthonormal.T @ (orthonormal @ foot)).astype(np.float32),
+        bases=np.ascontiguousarray(orthonormal, dtype=np.float32),
     )

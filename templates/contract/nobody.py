@@ -18,7 +18,7 @@ from templates.decoys.generator import DecoyGenerator
 from templates.distances import Metric
 from templates.keys.randomness import Keystream
 from templates.space.lifting import Strategy, lift, plain_strategy
-from templates.space.subspace import AffineSubspace, SubspaceBatch
+from templates.space.subspace import SubspaceBatch
 
 Array64 = NDArray[np.float64]
 
@@ -123,13 +123,13 @@ class Nobody:
         mean = self.generator.mean.astype(np.float64)
         moments = np.column_stack([root, mean]) / np.sqrt(np.sum(root**2) + mean @ mean)
         inside = np.empty(len(templates))
-        for row, template in enumerate(templates):
-            inside[row] = np.linalg.norm(template.basis.astype(np.float64) @ moments)
+        for row, basis in enumerate(templates.bases):
+            inside[row] = np.linalg.norm(basis.astype(np.float64) @ moments)
         feet = templates.feet.astype(np.float64)
         reach = np.sqrt(np.maximum(0.0, 1 - np.sum(feet**2, axis=1)))
         return np.asarray(feet @ moments[:, -1] + reach * inside)
 
-    def lift(self, stream: Keystream) -> AffineSubspace:
+    def lift(self, stream: Keystream) -> SubspaceBatch:
         """Lift one template of nobody, un-rotated."""
         return self._lift(1, stream)[0]
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 
 from templates.errors import InvalidTemplate, LiftingError
-from templates.space.subspace import AffineSubspace, span_basis
+from templates.space.subspace import SubspaceBatch, span_basis
 
 FORMAT = "veilface-template"
 VERSION = "1"
@@ -37,7 +37,7 @@ _CONTRACT_ID = re.compile(r"[0-9a-f]{64}")
 class WireTemplate:
     """What the bytes of a template say."""
 
-    subspace: AffineSubspace = field(repr=False)
+    subspace: SubspaceBatch = field(repr=False)
     contract_id: str
     dtype: WireDtype
 
@@ -51,12 +51,12 @@ class _Layout(NamedTuple):
     m: int
 
 
-def encode(subspace: AffineSubspace, *, contract_id: str, dtype: WireDtype = "float16") -> bytes:
+def encode(subspace: SubspaceBatch, *, contract_id: str, dtype: WireDtype = "float16") -> bytes:
     """Return the bytes of a template; equal templates give equal bytes.
 
     Parameters
     ----------
-    subspace : AffineSubspace
+    subspace : SubspaceBatch
     contract_id : str
         64 lower-case hexadecimal digits.
     dtype : {"float16", "float32"}
@@ -134,7 +134,7 @@ def decode_as_stored(
         The container is not exactly as in docs/formats.md.
     """
     layout, foot, basis = _numbers(data, max_n, max_m)
-    subspace = AffineSubspace(foot.astype(np.float32), basis.astype(np.float32))
+    subspace = SubspaceBatch(foot.astype(np.float32), basis.astype(np.float32))
     return WireTemplate(subspace, layout.contract_id, layout.dtype)
 
 
@@ -156,7 +156,7 @@ def _numbers(
 
 def _canonical(
     foot: NDArray[np.float64], basis: NDArray[np.float64], tolerance: float
-) -> AffineSubspace:
+) -> SubspaceBatch:
     """Check the numbers, then remove what rounding did to them."""
     # Entries of unit rows; also keeps the products below from overflowing.
     if max(np.abs(foot).max(), np.abs(basis).max()) > 1 + tolerance:
@@ -171,7 +171,7 @@ def _canonical(
     rows = _orthonormal(basis, gram)
     foot = foot - (rows @ foot) @ rows
     foot /= max(1.0, float(np.linalg.norm(foot)))
-    return AffineSubspace(foot.astype(np.float32), rows.astype(np.float32))
+    return SubspaceBatch(foot.astype(np.float32), rows.astype(np.float32))
 
 
 def _orthonormal(basis: NDArray[np.float64], gram: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,7 +1,7 @@
 """The secret rotations of templates: without the tenant's key, no two of them can be linked.
 
 Each template has a rotation of its own (docs/method.md §4.9). It maps a descriptor x to R x, before
-lifting or, which is the same, after it (``AffineSubspace.turned_by``). A probe is turned as the
+lifting or, which is the same, after it (``SubspaceBatch.turned_by``). A probe is turned as the
 template that it is compared with, so no distance changes.
 
 Where the person keeps a key, the holder's rotation comes first and the tenant's last: the tenant's

@@ -9,14 +9,13 @@ descriptor that was lifted nor on the decoys one by one.
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Self, overload
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from templates.errors import InvalidTemplate, LiftingError
 from templates.keys.randomness import Keystream
-from templates.space.dual import DualSubspace
 
 FLOAT32_TOLERANCE = 1e-5
 # Directions closer than this to the span of the others, relative to their own length, are noise
@@ -91,134 +90,83 @@ def _gram_schmidt(square: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class AffineSubspace:
-    """One private template 𝒟 = foot + span(basis).
-
-    Parameters
-    ----------
-    foot : ndarray of float32, shape (n,)
-        Foot point, orthogonal to the basis.
-    basis : ndarray of float32, shape (m, n)
-        Orthonormal rows, 1 ≤ m < n.
-
-    The constructor checks shapes only; :meth:`validate` checks the numbers.
-    """
-
-    foot: NDArray[np.float32]
-    basis: NDArray[np.float32]
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "foot", _stored(self.foot, 1, "foot point"))
-        object.__setattr__(self, "basis", _stored(self.basis, 2, "basis"))
-        if self.basis.shape[1] != self.foot.shape[0] or not 1 <= self.m < self.n:
-            raise InvalidTemplate(
-                f"a foot point of {self.foot.shape[0]} numbers does not fit a basis of shape "
-                f"{self.basis.shape}: expected (n,) and (m, n) with 1 <= m < n"
-            )
-
-    @classmethod
-    def through(cls, point: ArrayLike, directions: ArrayLike, *, stream: Keystream) -> Self:
-        """Return the template of ``point + span(directions)``.
-
-        See :meth:`SubspaceBatch.through`, of which this is the case of one row.
-
-        Parameters
-        ----------
-        point : array_like, shape (n,)
-        directions : array_like, shape (m, n)
-        stream : Keystream
-        """
-        batch = SubspaceBatch.through(
-            np.asarray(point)[None], np.asarray(directions)[None], stream=stream
-        )
-        return cls(batch.feet[0], batch.bases[0])
-
-    def __repr__(self) -> str:
-        return f"AffineSubspace(n={self.n}, m={self.m})"
-
-    @property
-    def n(self) -> int:
-        """Descriptor dimension."""
-        return int(self.foot.shape[0])
-
-    @property
-    def m(self) -> int:
-        """Subspace dimension."""
-        return int(self.basis.shape[0])
-
-    @property
-    def foot_norm(self) -> float:
-        """‖p‖, the distance of the set from the coordinate origin."""
-        return float(np.linalg.norm(self.foot.astype(np.float64)))
-
-    @property
-    def radius(self) -> float:
-        """Radius √(1 − ‖p‖²) of the intersection with the unit sphere; 0 where there is none."""
-        return float(np.sqrt(max(0.0, 1.0 - self.foot_norm**2)))
-
-    def project(self, points: ArrayLike) -> NDArray[np.float64]:
-        """Return the points of the set nearest to ``points``, shape (k, n) or (n,), in float64."""
-        basis = self.basis.astype(np.float64)
-        offset = np.asarray(points, dtype=np.float64) - self.foot
-        return self.foot + (offset @ basis.T) @ basis
-
-    def contains(self, points: ArrayLike, tol: float = 1e-5) -> NDArray[np.bool_]:
-        """Return which of ``points``, shape (k, n), are at most ``tol`` away from the set."""
-        gap = np.asarray(points, dtype=np.float64) - self.project(points)
-        return np.asarray(np.linalg.norm(gap, axis=-1) <= tol)
-
-    def validate(self, tol: float = FLOAT32_TOLERANCE) -> None:
-        """Check that the numbers are those of a template.
-
-        Raises
-        ------
-        InvalidTemplate
-            A number is not finite, the basis is not orthonormal or the foot point not orthogonal
-            to it within ``tol``, or the foot point lies outside the unit ball, where no set
-            through a unit descriptor has it.
-        """
-        if not (np.isfinite(self.foot).all() and np.isfinite(self.basis).all()):
-            raise InvalidTemplate("a template holds a number that is not finite")
-        basis, foot = self.basis.astype(np.float64), self.foot.astype(np.float64)
-        if np.abs(basis @ basis.T - np.eye(self.m)).max() > tol:
-            raise InvalidTemplate(f"the basis is not orthonormal within {tol:g}")
-        if np.abs(basis @ foot).max() > tol:
-            raise InvalidTemplate(f"the foot point is not orthogonal to the basis within {tol:g}")
-        if np.linalg.norm(foot) > 1 + tol:
-            raise InvalidTemplate("the foot point lies outside the unit ball")
-
-    def dual(self) -> DualSubspace:
-        """Return the same set as the intersection of n − m hyperplanes (supplement A)."""
-        return DualSubspace.of_primal(self.foot, self.basis)
-
-    def turned_by(self, turn: Turn) -> Self:
-        """Return the image of the set, as :meth:`SubspaceBatch.turned_by`."""
-        batch = SubspaceBatch.of([self]).turned_by(turn)
-        return type(self)(batch.feet[0], batch.bases[0])
-
-
-@dataclass(frozen=True, eq=False, repr=False)
 class SubspaceBatch:
-    """N templates of one dimension.
+    """N private templates 𝒟 = foot + span(basis) of one dimension; one template is a batch of one.
 
     Parameters
     ----------
     feet : ndarray of float32, shape (N, n)
+        Foot points, each orthogonal to its basis; (n,) for one template.
     bases : ndarray of float32, shape (N, m, n)
+        Orthonormal rows, 1 ≤ m < n; (m, n) for one template.
+
+    The constructor checks shapes only; :meth:`validate` checks the numbers.
     """
 
     feet: NDArray[np.float32]
     bases: NDArray[np.float32]
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "feet", _stored(self.feet, 2, "feet"))
-        object.__setattr__(self, "bases", _stored(self.bases, 3, "bases"))
+        feet, bases = np.asarray(self.feet), np.asarray(self.bases)
+        if feet.ndim == 1:
+            feet, bases = feet[None], bases[None]
+        object.__setattr__(self, "feet", _stored(feet, 2, "feet"))
+        object.__setattr__(self, "bases", _stored(bases, 3, "bases"))
         if self.feet.shape != (self.bases.shape[0], self.bases.shape[2]):
             raise InvalidTemplate(
                 f"feet of shape {self.feet.shape} do not fit bases of shape {self.bases.shape}"
             )
         if not 1 <= self.m < self.n:
             raise InvalidTemplate(f"expected 1 <= m < n, seen m = {self.m}, n = {self.n}")
+
+    @property
+    def foot(self) -> NDArray[np.float32]:
+        """Foot point of the one template, shape (n,)."""
+        (foot,) = self.feet
+        return np.asarray(foot)
+
+    @property
+    def basis(self) -> NDArray[np.float32]:
+        """Basis of the one template, shape (m, n)."""
+        (basis,) = self.bases
+        return np.asarray(basis)
+
+    @property
+    def foot_norm(self) -> float:
+        """‖p‖ of the one template: its distance from the coordinate origin."""
+        (norm,) = self.foot_norms
+        return float(norm)
+
+    def project(self, points: ArrayLike) -> NDArray[np.float64]:
+        """Points of the one set that are nearest to ``points``, (k, n) or (n,), in float64."""
+        basis = self.basis.astype(np.float64)
+        offset = np.asarray(points, dtype=np.float64) - self.foot
+        return np.asarray(self.foot + (offset @ basis.T) @ basis)
+
+    def contains(self, points: ArrayLike, tol: float = 1e-5) -> NDArray[np.bool_]:
+        """Which of ``points``, shape (k, n), are at most ``tol`` away from the one set."""
+        gap = np.asarray(points, dtype=np.float64) - self.project(points)
+        return np.asarray(np.linalg.norm(gap, axis=-1) <= tol)
+
+    def validate(self, tol: float = FLOAT32_TOLERANCE) -> None:
+        """Check that the numbers are those of templates.
+
+        Raises
+        ------
+        InvalidTemplate
+            A number is not finite, a basis is not orthonormal or a foot point not orthogonal
+            to it within ``tol``, or a foot point lies outside the unit ball, where no set
+            through a unit embedding has it.
+        """
+        if not self.is_finite:
+            raise InvalidTemplate("a template holds a number that is not finite")
+        bases, feet = self.bases.astype(np.float64), self.feet.astype(np.float64)
+        if np.abs(bases @ bases.transpose(0, 2, 1) - np.eye(self.m)).max(initial=0) > tol:
+            raise InvalidTemplate(f"the basis is not orthonormal within {tol:g}")
+        if np.abs(bases @ feet[:, :, None]).max(initial=0) > tol:
+            raise InvalidTemplate(f"the foot point is not orthogonal to the basis within {tol:g}")
+        if self.foot_norms.max(initial=0) > 1 + tol:
+            raise InvalidTemplate("the foot point lies outside the unit ball")
 
     @cached_property
     def is_finite(self) -> bool:
@@ -235,9 +183,9 @@ class SubspaceBatch:
 
         Parameters
         ----------
-        points : array_like, shape (N, n)
-            Any point of each set, a descriptor for instance.
-        directions : array_like, shape (N, m, n)
+        points : array_like, shape (N, n), or (n,) for one
+            Any point of each set, an embedding for instance.
+        directions : array_like, shape (N, m, n), or (m, n) for one
             Any basis of each direction space.
         stream : Keystream
             Source of the basis; nothing else of the template is random.
@@ -258,6 +206,8 @@ class SubspaceBatch:
         """
         start = np.asarray(points)
         spread = np.asarray(directions)
+        if start.ndim == 1:
+            start, spread = start[None], spread[None]
         if start.ndim != 2 or spread.ndim != 3:
             raise LiftingError(
                 f"expected points (N, n) and directions (N, m, n), "
@@ -289,15 +239,15 @@ class SubspaceBatch:
         return cls(feet, bases)
 
     @classmethod
-    def of(cls, subspaces: Sequence[AffineSubspace]) -> Self:
-        """Stack templates of one shape."""
-        if not subspaces:
+    def of(cls, batches: Sequence[Self]) -> Self:
+        """Join batches of one shape."""
+        if not batches:
             raise InvalidTemplate("an empty list has no dimension: give at least one template")
-        if len({(subspace.m, subspace.n) for subspace in subspaces}) > 1:
+        if len({(batch.m, batch.n) for batch in batches}) > 1:
             raise InvalidTemplate("templates of different dimensions do not fit in one batch")
         return cls(
-            np.stack([subspace.foot for subspace in subspaces]),
-            np.stack([subspace.basis for subspace in subspaces]),
+            np.concatenate([batch.feet for batch in batches]),
+            np.concatenate([batch.bases for batch in batches]),
         )
 
     def __repr__(self) -> str:
@@ -306,20 +256,11 @@ class SubspaceBatch:
     def __len__(self) -> int:
         return int(self.feet.shape[0])
 
-    @overload
-    def __getitem__(self, index: int) -> AffineSubspace: ...
+    def __getitem__(self, index: int | slice | NDArray[np.integer] | NDArray[np.bool_]) -> Self:
+        rows = [index] if isinstance(index, (int, np.integer)) else index
+        return type(self)(self.feet[rows], self.bases[rows])
 
-    @overload
-    def __getitem__(self, index: slice | NDArray[np.integer] | NDArray[np.bool_]) -> Self: ...
-
-    def __getitem__(
-        self, index: int | slice | NDArray[np.integer] | NDArray[np.bool_]
-    ) -> "AffineSubspace | Self":
-        if isinstance(index, (int, np.integer)):
-            return AffineSubspace(self.feet[index], self.bases[index])
-        return type(self)(self.feet[index], self.bases[index])
-
-    def __iter__(self) -> Iterator[AffineSubspace]:
+    def __iter__(self) -> Iterator[Self]:
         return (self[index] for index in range(len(self)))
 
     @property
@@ -342,14 +283,6 @@ class SubspaceBatch:
     def radii(self) -> NDArray[np.float64]:
         """Radii of the intersections with the unit sphere, shape (N,); 0 where there is none."""
         return np.sqrt(np.maximum(0.0, 1.0 - self.foot_norms**2))
-
-    def rotated(self, rotation: NDArray[np.float64]) -> Self:
-        """Return the images of the sets under the orthogonal (n, n) matrix: every x becomes R x."""
-        if rotation.shape != (self.n, self.n):
-            raise InvalidTemplate(
-                f"a rotation of shape {rotation.shape} does not fit embeddings of {self.n} numbers"
-            )
-        return self.turned_by(lambda points: points @ rotation.T)
 
     def turned_by(self, turn: Turn) -> Self:
         """Return the images of the sets under an orthogonal map of rows, shape (k, n).

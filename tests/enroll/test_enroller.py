@@ -15,7 +15,7 @@ from templates.errors import ContractMismatch, InvalidEmbedding, InvalidTemplate
 from templates.keys.rotation import TenantRotation, holder_rotation
 from templates.space.agreement import InconsistentImages
 from templates.space.lifting import Strategy, lift
-from templates.space.subspace import AffineSubspace
+from templates.space.subspace import SubspaceBatch
 from tests.verify.synthetic import (
     LIFT_SECRET,
     K,
@@ -47,7 +47,7 @@ def enroller(contract: Contract) -> Enroller:
     return Enroller(contract, make_generator(), rotation=ROTATION, lift_secret=LIFT_SECRET)
 
 
-def stored_template(enrollment: Enrollment, rotation: TenantRotation = ROTATION) -> AffineSubspace:
+def stored_template(enrollment: Enrollment, rotation: TenantRotation = ROTATION) -> SubspaceBatch:
     """Un-rotated, as the decoys are."""
     return wire.decode(enrollment.wire).subspace.turned_by(
         rotation.of(enrollment.template_id).turned_back
@@ -70,7 +70,7 @@ def test_the_template_holds_the_mean_of_the_photos_and_is_rotated(
     assert [result.index for result in enrollment.per_photo] == [0, 1, 2]
 
 
-def largest_angle(first: AffineSubspace, second: AffineSubspace) -> float:
+def largest_angle(first: SubspaceBatch, second: SubspaceBatch) -> float:
     """Sine of the largest angle between the linear spans of two templates: 0 if they are one."""
     rows, others = (
         np.linalg.qr(np.vstack([template.foot, template.basis]).astype(np.float64).T)[0].T
@@ -125,7 +125,7 @@ def test_other_photos_another_deployment_and_another_contract_give_other_decoys(
         assert np.linalg.svd(shared, compute_uv=False).max() < 0.99
 
 
-def without_key(enrollment: Enrollment, key: bytes) -> AffineSubspace:
+def without_key(enrollment: Enrollment, key: bytes) -> SubspaceBatch:
     """Un-rotated, as the descriptors are: what opens it has the holder's key as well."""
     assert enrollment.holder_salt is not None
     rotation = holder_rotation(key, enrollment.holder_salt, K)
@@ -255,7 +255,7 @@ def test_another_source_or_rotation_is_refused(contract: Contract) -> None:
         Enroller(contract, make_generator(), rotation=tenant_rotation(8), lift_secret=LIFT_SECRET)
 
 
-def client_template(contract: Contract, *, m: int = M) -> AffineSubspace:
+def client_template(contract: Contract, *, m: int = M) -> SubspaceBatch:
     return lift(POINTS[:1], strategy=contract.binding.strategy, m=m, source=make_generator())[0]
 
 
@@ -292,7 +292,7 @@ def test_clients_templates_that_break_the_contract_are_refused(
         enroller.from_template(wire.encode(good, contract_id="d" * 64))
     with pytest.raises(InvalidTemplate, match="60 numbers and m = 6, not 60 and m = 5"):
         enroller.from_template(wire.encode(client_template(contract, m=5), contract_id=contract_id))
-    central = AffineSubspace(np.zeros(K, dtype=np.float32), good.basis)
+    central = SubspaceBatch(np.zeros(K, dtype=np.float32), good.basis)
     with pytest.raises(InvalidTemplate, match="foot point is outside the range"):
         enroller.from_template(wire.encode(central, contract_id=contract_id))
     with pytest.raises(InvalidTemplate):

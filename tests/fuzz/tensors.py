@@ -17,7 +17,7 @@ from templates.decoys.pool import POOL_CONTEXT, POOL_MAGIC
 from templates.decoys.source import Attributes
 from templates.keys.randomness import Keystream
 from templates.keys.sealing import KeyringSealer, MasterKeyring
-from templates.space.subspace import AffineSubspace
+from templates.space.subspace import SubspaceBatch
 from tests.fuzz.documents import Raw, hostile
 from tests.fuzz.mutations import mutated, some, span
 
@@ -36,16 +36,16 @@ def repeatable(rng: random.Random) -> Any:
     return mock.patch("templates.keys.sealing.os.urandom", rng.randbytes)
 
 
-def subspace(n: int, m: int, seed: int = 0, *, norm: float = 0.5) -> AffineSubspace:
+def subspace(n: int, m: int, seed: int = 0, *, norm: float = 0.5) -> SubspaceBatch:
     """A template of nobody."""
     with Keystream.seeded("fuzz", seed) as stream:
         point = stream.normal((n,))
-        made = AffineSubspace.through(
+        made = SubspaceBatch.through(
             point / np.linalg.norm(point), stream.normal((m, n)), stream=stream
         )
     foot = made.foot.astype(np.float64)
     foot -= made.basis.T.astype(np.float64) @ (made.basis @ foot)
-    return AffineSubspace((foot * norm / np.linalg.norm(foot)).astype(np.float32), made.basis)
+    return SubspaceBatch((foot * norm / np.linalg.norm(foot)).astype(np.float32), made.basis)
 
 
 def container(header: bytes, payload: bytes) -> bytes:

@@ -10,7 +10,7 @@ from templates.decoys import DecoyGenerator
 from templates.keys.randomness import Keystream
 from templates.keys.rotation import ROTATION_VERSION
 from templates.space.lifting import Strategy, lift
-from templates.space.subspace import AffineSubspace, SubspaceBatch
+from templates.space.subspace import SubspaceBatch
 from verify import CalibrationOptions, calibrate
 
 N, K, M = 64, 56, 8
@@ -71,11 +71,11 @@ def contract() -> Contract:
     ).contract
 
 
-def wolf() -> AffineSubspace:
+def wolf() -> SubspaceBatch:
     """The leading axes of faces, with a foot point along their mean, as honest templates have."""
     mean = decoys().mean.astype(np.float64)
     axes = np.eye(K)[:M]
     foot = mean - axes.T @ (axes @ mean)
     low, high = contract().template_foot_point_norm
     foot *= (low + high) / 2 / np.linalg.norm(foot)
-    return AffineSubspace(foot.astype(np.float32), axes.astype(np.float32))
+    return SubspaceBatch(foot.astype(np.float32), axes.astype(np.float32))

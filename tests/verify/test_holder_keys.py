@@ -14,7 +14,7 @@ from templates.contract.document import Contract
 from templates.distances import Metric
 from templates.keys.rotation import SignedCosineRotation, holder_rotation
 from templates.space.lifting import lift
-from templates.space.subspace import AffineSubspace
+from templates.space.subspace import SubspaceBatch
 from tests.verify.synthetic import (
     K,
     draw_people,
@@ -71,18 +71,18 @@ def lifted_by_a_client(contract: Contract, descriptor: NDArray[np.float32], m: i
     return wire.encode(template[0], contract_id=contract.contract_id)
 
 
-def without_tenant(enrollment: Enrollment) -> AffineSubspace:
+def without_tenant(enrollment: Enrollment) -> SubspaceBatch:
     rotation = ROTATION.of(enrollment.template_id)
     return wire.decode(enrollment.wire).subspace.turned_by(rotation.turned_back)
 
 
-def without_both(enrollment: Enrollment, key: bytes) -> AffineSubspace:
+def without_both(enrollment: Enrollment, key: bytes) -> SubspaceBatch:
     assert enrollment.holder_salt is not None
     rotation = holder_rotation(key, enrollment.holder_salt, K)
     return without_tenant(enrollment).turned_by(rotation.turned_back)
 
 
-def spherical(probe: NDArray[np.floating], template: AffineSubspace) -> float:
+def spherical(probe: NDArray[np.floating], template: SubspaceBatch) -> float:
     foot, basis = template.foot.astype(np.float64), template.basis.astype(np.float64)
     e = probe.astype(np.float64)
     return float(e @ foot + np.sqrt(1 - foot @ foot) * np.linalg.norm(basis @ e))
@@ -128,7 +128,7 @@ def test_the_key_accepts_and_another_or_none_does_not(
 def test_without_the_key_no_score_is_enough(verifier: Verifier, keyed: Enrollment) -> None:
     """Not even that of a probe made to lie in the template as it is turned without a key."""
     template = without_tenant(keyed)
-    inside = unit((template.foot + template.radius * template.basis[0])[None])[0]
+    inside = unit((template.foot + template.radii[0] * template.basis[0])[None])[0]
     unturned = verify.verifier.holder_rotation(verifier._nobodys_key, str(keyed.holder_salt), K)
     probe = embeddings_of(unit(unturned.turned_back(inside[None].astype(np.float64))))[0]
     decision = verifier.decide_embedding(probe, keyed)
@@ -141,7 +141,7 @@ def test_a_thief_who_may_send_embeddings_chooses_a_key(
 ) -> None:
     """What the key does not protect from: template and rotation key were stolen."""
     template, salt = without_tenant(keyed), str(keyed.holder_salt)
-    inside = unit((template.foot + template.radius * template.basis[0])[None])
+    inside = unit((template.foot + template.radii[0] * template.basis[0])[None])
     probe = embeddings_of(holder_rotation(OTHER, salt, K).turned_back(inside.astype(np.float64)))[0]
     assert verifier.decide_embedding(probe, keyed, holder_key=OTHER).accepted
 

@@ -17,7 +17,7 @@ from templates.keys.randomness import Keystream
 from templates.keys.rotation import SignedCosineRotation, TenantRotation
 from templates.space.agreement import InconsistentImages
 from templates.space.lifting import lift
-from templates.space.subspace import AffineSubspace
+from templates.space.subspace import SubspaceBatch
 from tests.verify.synthetic import (
     LIFT_SECRET,
     K,
@@ -80,7 +80,7 @@ def nobody(contract: Contract) -> StandIn:
     return StandIn(wire.encode(template, contract_id=contract.contract_id, dtype="float16"))
 
 
-def spherical(probe: NDArray[np.floating], template: AffineSubspace) -> float:
+def spherical(probe: NDArray[np.floating], template: SubspaceBatch) -> float:
     foot, basis = template.foot.astype(np.float64), template.basis.astype(np.float64)
     e = probe.astype(np.float64)
     return float(e @ foot + np.sqrt(1 - foot @ foot) * np.linalg.norm(basis @ e))
@@ -235,7 +235,7 @@ def test_lifted_probes_are_decided(
 def test_lifted_probes_that_are_not_honest_are_refused(
     contract: Contract, verifier: Verifier, stored: list[Enrollment]
 ) -> None:
-    central = AffineSubspace(np.zeros(K, dtype=np.float32), np.eye(K, dtype=np.float32)[:2])
+    central = SubspaceBatch(np.zeros(K, dtype=np.float32), np.eye(K, dtype=np.float32)[:2])
     data = wire.encode(central, contract_id=contract.contract_id)
     with pytest.raises(InvalidTemplate, match="foot point is outside the range"):
         verifier.decide_template(data, stored[0])
@@ -262,7 +262,7 @@ def test_stored_templates_of_another_contract_are_refused(
     with pytest.raises(ContractMismatch, match="the stored template belongs to the contract eeee"):
         verifier.decide_embedding(NEW.descriptors[0], dataclasses.replace(stored[0], wire=foreign))
     thin = wire.encode(
-        AffineSubspace(template.foot, template.basis[: M - 1]), contract_id=contract.contract_id
+        SubspaceBatch(template.foot, template.basis[: M - 1]), contract_id=contract.contract_id
     )
     with pytest.raises(InvalidTemplate, match="dimensions"):
         verifier.decide_embedding(NEW.descriptors[0], dataclasses.replace(stored[0], wire=thin))
@@ -386,7 +386,7 @@ def test_wolves_are_stopped_by_what_is_expected_of_them(contract: Contract) -> N
     foot = np.zeros(K, dtype=np.float32)
     foot[4] = np.mean(calibration.foot_point_norm)
     wolf = wire.encode(
-        AffineSubspace(foot, np.eye(K, dtype=np.float32)[:4]),
+        SubspaceBatch(foot, np.eye(K, dtype=np.float32)[:4]),
         contract_id=wolves_contract.contract_id,
     )
     people = unit(rng.normal(size=(150, N)) * spread)

@@ -14,7 +14,7 @@ from templates.contract import wire
 from templates.keys.holder_key import encode_holder_key
 from templates.keys.rotation import holder_rotation
 from templates.space.agreement import mean_embedding
-from templates.space.subspace import AffineSubspace, SubspaceBatch
+from templates.space.subspace import SubspaceBatch
 from tests.api.client import Client
 from tests.api.deployment import AXES, Deployment, M, images, photo
 
@@ -28,7 +28,7 @@ def photos_of(person: int) -> list[bytes]:
 
 def stolen(
     client: Client, subject: str, photos: Sequence[bytes], key: bytes | None
-) -> AffineSubspace:
+) -> SubspaceBatch:
     """Enroll, read what is stored, and undo its rotations: every key is the thief's."""
     answer = client.put(
         f"/v1/subjects/{subject}/enrollment",

@@ -15,7 +15,7 @@ from api.process.runtime import file_sealer, open_keyring
 from attacks.stored.wolves import canonical
 from models.pack import ModelPack
 from templates.contract import wire
-from templates.space.subspace import AffineSubspace
+from templates.space.subspace import SubspaceBatch
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, deploy
 from tests.api.shapes import assert_answer, assert_error
@@ -60,7 +60,7 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Client, 
         yield client, deployment
 
 
-def put(client: Client, subject: str, template: AffineSubspace) -> httpx.Response:
+def put(client: Client, subject: str, template: SubspaceBatch) -> httpx.Response:
     contract_id = client.get("/v1/contract").json()["contract_id"]
     data = wire.encode(template, contract_id=contract_id)
     path = f"/v1/subjects/{subject}/enrollment"
@@ -74,7 +74,7 @@ def decision(client: Client, subject: str, embedding: NDArray[np.float32]) -> st
     return str(answer["decision"])
 
 
-def many_people(photos: NDArray[np.float32]) -> AffineSubspace:
+def many_people(photos: NDArray[np.float32]) -> SubspaceBatch:
     """The affine span of one photo each of M + 1 people, (M + 1, n)."""
     points = decoys().project(photos).astype(np.float64)
     return canonical(points[0], points[1:] - points[0])

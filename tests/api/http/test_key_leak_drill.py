@@ -20,7 +20,7 @@ from templates.decoys import DecoySource, client_source
 from templates.errors import InvalidTemplate, SealError
 from templates.keys.rotation import TenantRotation
 from templates.keys.sealing import MasterKeyring
-from templates.space.subspace import AffineSubspace
+from templates.space.subspace import SubspaceBatch
 from templates.store import TemplateStore
 from templates.store.audit_archive import verify_archive
 from templates.store.audit_log import Anchor, Head, Line, head_columns, line_mac
@@ -53,7 +53,7 @@ class Thief:
         )
         self.secrets = {name: self.store.secrets.get(name) for name in SecretName}
 
-    def stolen(self, subject: str) -> AffineSubspace:
+    def stolen(self, subject: str) -> SubspaceBatch:
         """The template, turned back."""
         found = self.store.subjects.get("default", subject)
         assert found is not None
@@ -109,7 +109,7 @@ def _read(database: Database, table: type[Any], condition: Any) -> dict[str, Any
 
 
 def unit_vectors(
-    template: AffineSubspace, embedding: NDArray[np.float32], source: DecoySource
+    template: SubspaceBatch, embedding: NDArray[np.float32], source: DecoySource
 ) -> NDArray[np.float64]:
     """Embeddings whose projections are of a template, each at distance 0 from it: (M, N).
 

@@ -11,7 +11,7 @@ from templates.contract import wire
 from templates.keys.randomness import Keystream
 from templates.keys.sealing import MasterKeyring
 from templates.space.lifting import Strategy, lift
-from templates.space.subspace import AffineSubspace
+from templates.space.subspace import SubspaceBatch
 from tests.api.client import Client
 from tests.api.deployment import AXES, PROBE_M, Deployment, N, bearer, deploy, images, photo
 from tests.api.http.test_enrollment import b64
@@ -214,7 +214,7 @@ def test_hostile_lifted_probes(client: Client, sender: str, deployment: Deployme
     whole = probe(deployment, descriptor)
     rng = np.random.default_rng(0)
     basis = np.linalg.qr(rng.normal(size=(AXES, PROBE_M)))[0].T
-    central = AffineSubspace(np.zeros(AXES), basis)
+    central = SubspaceBatch(np.zeros(AXES), basis)
     for data in (
         b"",
         whole[:10],
@@ -226,7 +226,7 @@ def test_hostile_lifted_probes(client: Client, sender: str, deployment: Deployme
         assert_error(ask(client, sender, json={"template": b64(data)}), 400, "invalid_template")
     other_m = probe(deployment, descriptor, m=PROBE_M + 1)
     assert_error(ask(client, sender, json={"template": b64(other_m)}), 422, "uncalibrated")
-    other = AffineSubspace(basis[0] * 0.0 + np.eye(AXES)[0] * 0, basis)
+    other = SubspaceBatch(basis[0] * 0.0 + np.eye(AXES)[0] * 0, basis)
     foreign = wire.encode(other, contract_id="0" * 64)
     assert_error(ask(client, sender, json={"template": b64(foreign)}), 409, "contract_mismatch")
 

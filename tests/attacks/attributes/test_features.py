@@ -48,8 +48,8 @@ def test_features_agree_with_their_formulas() -> None:
             w @ p,
             moments[np.triu_indices(4)],
             [np.linalg.norm(p)],
-            mu @ p + template.radius * widths,
-            template.radius * np.sqrt(np.diag(moments)),
+            mu @ p + template.radii[0] * widths,
+            template.radii[0] * np.sqrt(np.diag(moments)),
         ]
         start = np.concatenate(wanted)
         np.testing.assert_allclose(row[: len(start)], start, atol=1e-5)

@@ -17,7 +17,7 @@ from templates.keys.randomness import Keystream
 from templates.keys.rotation import ROTATION_VERSION
 from templates.space.agreement import InconsistentImages, mean_embedding, weakest_split
 from templates.space.lifting import Strategy, lift
-from templates.space.subspace import AffineSubspace
+from templates.space.subspace import SubspaceBatch
 from tests.clients.javascript.conftest import Node
 
 CONTRACT_ID = "ab" * 32
@@ -116,7 +116,7 @@ def check_lifts(
         foot, basis = unb64(ours["foot"], "<f4"), unb64(ours["basis"], "<f4").reshape(m, source.k)
         np.testing.assert_allclose(basis @ basis.T, np.eye(m), atol=1e-6)
         np.testing.assert_allclose(basis @ foot, 0, atol=1e-6)
-        template = AffineSubspace(foot, basis)
+        template = SubspaceBatch(foot, basis)
         assert template.contains(point, tol=1e-5).all()
         decoded = wire.decode(base64.b64decode(ours["wire"]))
         assert decoded.contract_id == CONTRACT_ID

@@ -12,7 +12,7 @@ from templates.decoys import DecoyGenerator
 from templates.distances import Metric, pairwise_distances, similarity
 from templates.keys.randomness import Keystream
 from templates.space.lifting import Strategy, lift
-from templates.space.subspace import AffineSubspace, SubspaceBatch
+from templates.space.subspace import SubspaceBatch
 
 K, M, TEMPLATES = 96, 34, 400
 STRATEGIES = [Strategy.ADVERSARIAL, Strategy.HYBRID, Strategy.RANDOM]
@@ -79,7 +79,7 @@ def test_a_template_of_leading_axes_is_nearer_to_strangers_than_any_lifted_one()
     honest = nobody().stranger_similarity(templates(Strategy.ADVERSARIAL))
     limit = honest.mean() + 6 * honest.std()
     foot = 0.1 * np.eye(K, dtype=np.float32)[-1]
-    wolf = AffineSubspace(foot=foot, basis=np.eye(K, dtype=np.float32)[:M])
+    wolf = SubspaceBatch(foot, np.eye(K, dtype=np.float32)[:M])
     assert nobody().stranger_similarity(SubspaceBatch.of([wolf]))[0] > limit
     assert honest.max() < limit
 

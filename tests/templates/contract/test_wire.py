@@ -23,13 +23,13 @@ from templates.distances import Metric, paired_distances, pairwise_distances
 from templates.errors import InvalidTemplate
 from templates.keys.randomness import Keystream
 from templates.space.lifting import lift
-from templates.space.subspace import AffineSubspace, SubspaceBatch
+from templates.space.subspace import SubspaceBatch
 
 CONTRACT = "0123456789abcdef" * 4
 DTYPES: tuple[WireDtype, ...] = ("float16", "float32")
 
 
-def template(n: int = 24, m: int = 5, seed: int = 0) -> AffineSubspace:
+def template(n: int = 24, m: int = 5, seed: int = 0) -> SubspaceBatch:
     stream = Keystream.seeded("wire", seed)
     descriptor = stream.normal((1, n))
     descriptor /= np.linalg.norm(descriptor)
@@ -52,7 +52,7 @@ def test_a_point_is_as_far_from_a_template_as_it_was_stored(dtype: WireDtype, me
     """The rounding of the wire is allowed for where it was not removed."""
     point = Keystream.seeded("as stored").normal((1, 512))
     point /= np.linalg.norm(point)
-    member = AffineSubspace.through(
+    member = SubspaceBatch.through(
         point[0], Keystream.seeded("decoys").normal((160, 512)), stream=Keystream.seeded("set")
     )
     for made in (member, template(512, 160)):
@@ -183,7 +183,7 @@ def test_what_cannot_be_written_is_refused():
     with pytest.raises(InvalidTemplate, match="float16 or float32"):
         encode(good, contract_id=CONTRACT, dtype="float64")  # type: ignore[arg-type]
     with pytest.raises(InvalidTemplate, match="not orthonormal"):
-        encode(AffineSubspace(good.foot, good.basis * 1.1), contract_id=CONTRACT)
+        encode(SubspaceBatch(good.foot, good.basis * 1.1), contract_id=CONTRACT)
 
 
 # --- hostile input -----------------------------------------------------------------------------
@@ -316,7 +316,7 @@ def test_wrong_numbers_are_refused(dtype: WireDtype):
 def test_a_set_through_the_origin_is_a_template():
     """The format admits it; the contract's range of foot-point norms is the caller's check."""
     good = template()
-    central = AffineSubspace(np.zeros_like(good.foot), good.basis)
+    central = SubspaceBatch(np.zeros_like(good.foot), good.basis)
     assert decode(encode(central, contract_id=CONTRACT)).subspace.foot_norm == 0
 
 

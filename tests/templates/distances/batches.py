@@ -11,7 +11,7 @@ import scipy.linalg
 from templates.distances import Metric, Neighbours, exact
 from templates.keys.randomness import Keystream
 from templates.space.lifting import lift
-from templates.space.subspace import AffineSubspace, SubspaceBatch
+from templates.space.subspace import SubspaceBatch
 
 N = 24
 METRICS = [str(metric) for metric in Metric]
@@ -65,9 +65,9 @@ def units(stream: Keystream, count: int, n: int = N) -> np.ndarray:
     return rows / np.linalg.norm(rows, axis=1, keepdims=True)
 
 
-def through(members: np.ndarray, seed: int = 0) -> AffineSubspace:
+def through(members: np.ndarray, seed: int = 0) -> SubspaceBatch:
     """The set that holds all members."""
-    return AffineSubspace.through(
+    return SubspaceBatch.through(
         members[0], members[1:] - members[0], stream=Keystream.seeded("through", seed)
     )
 
@@ -91,12 +91,12 @@ def faces(count: int, m: int, seed: int, n: int = 128) -> SubspaceBatch:
     return SubspaceBatch.through(members[:, 0], members[:, 1:] - members[:, :1], stream=stream)
 
 
-def pairs() -> dict[str, tuple[AffineSubspace, AffineSubspace]]:
+def pairs() -> dict[str, tuple[SubspaceBatch, SubspaceBatch]]:
     """Pairs of subspaces in every relation that matters."""
     stream = Keystream.seeded("pairs")
     x = units(stream, 14)
     axes = scipy.linalg.qr(stream.normal((N, N)))[0]
-    of = AffineSubspace
+    of = SubspaceBatch
     tilt = np.cos(1e-3) * axes[0] + np.sin(1e-3) * axes[1]
     crossing = 0.5 * axes[9] + 0.3 * (np.cos(0.01) * axes[1] - np.sin(0.01) * axes[0])
     crossed = np.cos(0.01) * axes[0] + np.sin(0.01) * axes[1]
@@ -113,7 +113,7 @@ def pairs() -> dict[str, tuple[AffineSubspace, AffineSubspace]]:
         "orthogonal": (of(0.4 * axes[8], axes[:3]), of(0.5 * axes[9], axes[3:6])),
         "parallel": (of(0.4 * axes[8], axes[:3]), of(0.5 * axes[9], axes[:3])),
         "parallel, other basis": tuple(
-            AffineSubspace.through(foot, plane, stream=Keystream.seeded("plane", seed))
+            SubspaceBatch.through(foot, plane, stream=Keystream.seeded("plane", seed))
             for seed, foot in enumerate((0.4 * axes[8], 0.5 * axes[9]))
         ),
         # The closest points are 30 away from the foot points: float32 products do not do.

@@ -22,7 +22,7 @@ from templates.distances import (
 from templates.errors import InvalidEmbedding, InvalidTemplate, TemplateError
 from templates.keys.randomness import Keystream
 from templates.space.lifting import lift
-from templates.space.subspace import AffineSubspace, SubspaceBatch
+from templates.space.subspace import SubspaceBatch
 from tests.templates.distances.batches import (
     BACKENDS,
     METRICS,
@@ -39,7 +39,7 @@ from tests.templates.distances.batches import (
 # --- independent computations, in float64 ------------------------------------------------------
 
 
-def brute_euclidean(a: AffineSubspace, b: AffineSubspace) -> float:
+def brute_euclidean(a: SubspaceBatch, b: SubspaceBatch) -> float:
     """Least squares by singular values; directions equal up to float32 storage count once."""
     gap = b.foot.astype(np.float64) - a.foot
     rows = np.vstack([a.basis, b.basis]).astype(np.float64)
@@ -47,14 +47,14 @@ def brute_euclidean(a: AffineSubspace, b: AffineSubspace) -> float:
     return float(np.linalg.norm(gap - rows.T @ solution))
 
 
-def brute_spherical(a: AffineSubspace, b: AffineSubspace, restarts: int = 8) -> float:
+def brute_spherical(a: SubspaceBatch, b: SubspaceBatch, restarts: int = 8) -> float:
     """Quasi-Newton minimisation over both spheres from random starts."""
     p, q = a.foot.astype(np.float64), b.foot.astype(np.float64)
     d, e = a.basis.astype(np.float64), b.basis.astype(np.float64)
 
     def gap(x: np.ndarray) -> float:
         u, v = x[: a.m] / np.linalg.norm(x[: a.m]), x[a.m :] / np.linalg.norm(x[a.m :])
-        return float(np.sum((p + a.radius * d.T @ u - q - b.radius * e.T @ v) ** 2))
+        return float(np.sum((p + a.radii[0] * d.T @ u - q - b.radii[0] * e.T @ v) ** 2))
 
     starts = Keystream.seeded("restarts").normal((restarts, a.m + b.m))
     options = {"gtol": 1e-10}
@@ -64,18 +64,18 @@ def brute_spherical(a: AffineSubspace, b: AffineSubspace, restarts: int = 8) -> 
     return float(np.sqrt(best))
 
 
-def brute_point(point: np.ndarray, b: AffineSubspace, metric: str) -> float:
+def brute_point(point: np.ndarray, b: SubspaceBatch, metric: str) -> float:
     offset = point - b.foot.astype(np.float64)
     basis = b.basis.astype(np.float64)
     inside = basis.T @ scipy.linalg.lstsq(basis.T, offset)[0]
     if metric == "euclidean":
         return float(np.linalg.norm(offset - inside))
     # The nearest point of the sphere around the foot point lies towards the projection.
-    nearest = b.foot + b.radius * inside / np.linalg.norm(inside)
+    nearest = b.foot + b.radii[0] * inside / np.linalg.norm(inside)
     return float(np.linalg.norm(point - nearest))
 
 
-BRUTE: dict[str, Callable[[AffineSubspace, AffineSubspace], float]] = {
+BRUTE: dict[str, Callable[[SubspaceBatch, SubspaceBatch], float]] = {
     "euclidean": brute_euclidean,
     "spherical": brute_spherical,
 }
@@ -153,6 +153,39 @@ def test_a_member_is_at_distance_zero(metric: str, name: str):
     assert seen.max() < (1e-6 if metric == "euclidean" else 2e-4)
 
 
+def dual_distance(p: np.ndarray, d: np.ndarray, q: np.ndarray, e: np.ndarray) -> float:
+    """Distance by hyperplanes (supplement A): 3n − 2m unknowns, the closest point and multipliers.
+
+    A set of directions (0, n) is a point.
+    """
+    n = len(p)
+    own, others = (scipy.linalg.null_space(rows).T if len(rows) else np.eye(n) for rows in (d, e))
+    system = np.block(
+        [
+            [own, np.zeros((len(own), len(own) + len(others)))],
+            [others, np.zeros((len(others), len(own))), np.eye(len(others))],
+            [np.zeros((n, n)), own.T, -others.T],
+        ]
+    )
+    right_side = np.concatenate([own @ p, others @ q, np.zeros(n)])
+    multipliers = np.linalg.lstsq(system, right_side, rcond=None)[0][n + len(own) :]
+    return float(np.linalg.norm(multipliers @ others))
+
+
+@settings(max_examples=30)
+@given(n=st.integers(6, 24), dims=st.tuples(st.floats(0, 1), st.floats(0, 1)), seed=st.integers(0))
+def test_the_specification_agrees_with_the_dual_form(n: int, dims: tuple, seed: int):
+    m, k = (1 + int(part * (n // 2 - 2)) for part in dims)  # where the dual is not singular
+    a, b = randoms(1, m, seed=seed, n=n), randoms(1, k, seed=seed + 1, n=n)
+    (p, d), (q, e) = ((x.foot.astype(np.float64), x.basis.astype(np.float64)) for x in (a, b))
+    seen = matrix("exact", a, b, metric="euclidean")[0, 0]
+    assert seen == pytest.approx(dual_distance(p, d, q, e), rel=1e-9, abs=1e-9)
+    point = units(Keystream.seeded(seed), 1, n)
+    seen = matrix("exact", point, b, metric="euclidean")[0, 0]
+    expected = dual_distance(point[0], np.empty((0, n)), q, e)
+    assert seen == pytest.approx(expected, rel=1e-9, abs=1e-9)
+
+
 # --- the two in float32 against float64 --------------------------------------------------------
 
 
@@ -227,8 +260,8 @@ def restarted_similarities(restarts: int) -> np.ndarray:
         for j, y in enumerate(b):
             p, q = x.foot.astype(np.float64), y.foot.astype(np.float64)
             d, e = x.basis.astype(np.float64), y.basis.astype(np.float64)
-            g, h = x.radius * d @ q, y.radius * e @ p
-            middle = x.radius * y.radius * d @ e.T
+            g, h = x.radii[0] * d @ q, y.radii[0] * e @ p
+            middle = x.radii[0] * y.radii[0] * d @ e.T
             v = Keystream.seeded("restart", i, j).normal((y.m, restarts))
             for _ in range(2000):
                 u = g[:, None] + middle @ v

@@ -7,11 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from templates.errors import InvalidTemplate, LiftingError, TemplateError
+from templates.errors import InvalidTemplate, LiftingError
 from templates.keys.randomness import Keystream
 from templates.space import subspace
-from templates.space.dual import DualSubspace
-from templates.space.subspace import AffineSubspace, SubspaceBatch, span_basis
+from templates.space.subspace import SubspaceBatch, span_basis
 
 
 def units(stream: Keystream, count: int, n: int) -> np.ndarray:
@@ -19,10 +18,10 @@ def units(stream: Keystream, count: int, n: int) -> np.ndarray:
     return rows / np.linalg.norm(rows, axis=1, keepdims=True)
 
 
-def through_all(members: np.ndarray, first: int, *, stream: Keystream) -> AffineSubspace:
+def through_all(members: np.ndarray, first: int, *, stream: Keystream) -> SubspaceBatch:
     """The set that holds all members, described from one of them."""
     others = np.delete(members, first, axis=0)
-    return AffineSubspace.through(members[first], others - members[first], stream=stream)
+    return SubspaceBatch.through(members[first], others - members[first], stream=stream)
 
 
 @given(n=st.integers(2, 40), m_part=st.floats(0, 1), seed=st.integers(0, 10**6))
@@ -46,7 +45,7 @@ def test_foot_norm_is_the_cosine_to_a_unit_descriptor():
     template = through_all(members, 2, stream=stream)
     cosines = members @ template.foot / np.linalg.norm(template.foot)
     np.testing.assert_allclose(cosines, template.foot_norm, atol=1e-6)
-    assert template.radius == pytest.approx(np.sqrt(1 - template.foot_norm**2))
+    assert template.radii[0] == pytest.approx(np.sqrt(1 - template.foot_norm**2))
 
 
 def test_equal_sets_give_equal_templates_whatever_describes_them():
@@ -58,7 +57,7 @@ def test_equal_sets_give_equal_templates_whatever_describes_them():
         np.testing.assert_allclose(again.foot, first.foot, atol=1e-6)
         np.testing.assert_allclose(again.basis, first.basis, atol=1e-6)
     point = members.mean(axis=0)
-    mixed = AffineSubspace.through(
+    mixed = SubspaceBatch.through(
         point, mixing @ (members[1:] - members[0]), stream=Keystream.seeded("lift")
     )
     np.testing.assert_allclose(mixed.basis, first.basis, atol=1e-6)
@@ -161,9 +160,9 @@ def test_degenerate_requests_are_refused():
         (stream.normal((3, 9)), "do not fit"),
     ):
         with pytest.raises(LiftingError, match=reason):
-            AffineSubspace.through(point, bad, stream=stream)
+            SubspaceBatch.through(point, bad, stream=stream)
     with pytest.raises(LiftingError, match="axes"):
-        SubspaceBatch.through(point, directions, stream=stream)
+        SubspaceBatch.through(point, directions[None], stream=stream)
 
 
 def test_validation_names_each_fault():
@@ -173,11 +172,11 @@ def test_validation_names_each_fault():
     nan = basis.copy()
     nan[1, 1] = np.nan
     for bad, reason in (
-        (AffineSubspace(foot, nan), "not finite"),
-        (AffineSubspace(foot, basis * 1.001), "not orthonormal"),
-        (AffineSubspace(foot, basis[[0, 0, 1]]), "not orthonormal"),
-        (AffineSubspace(foot + 1e-3 * basis[0], basis), "not orthogonal"),
-        (AffineSubspace(foot * (1.01 / good.foot_norm), basis), "outside the unit ball"),
+        (SubspaceBatch(foot, nan), "not finite"),
+        (SubspaceBatch(foot, basis * 1.001), "not orthonormal"),
+        (SubspaceBatch(foot, basis[[0, 0, 1]]), "not orthonormal"),
+        (SubspaceBatch(foot + 1e-3 * basis[0], basis), "not orthogonal"),
+        (SubspaceBatch(foot * (1.01 / good.foot_norm), basis), "outside the unit ball"),
     ):
         with pytest.raises(InvalidTemplate, match=reason):
             bad.validate()
@@ -191,12 +190,12 @@ def test_shapes_are_checked_by_the_constructors():
         (np.zeros((1, 4)), np.zeros((2, 4))),
     ):
         with pytest.raises(InvalidTemplate):
-            AffineSubspace(foot, basis)
+            SubspaceBatch(foot, basis)
         with pytest.raises(InvalidTemplate):
             SubspaceBatch(foot[None], basis[None])
     with pytest.raises(InvalidTemplate, match="at least one"):
         SubspaceBatch.of([])
-    one, other = (AffineSubspace(np.zeros(4), np.eye(m, 4)) for m in (1, 2))
+    one, other = (SubspaceBatch(np.zeros(4), np.eye(m, 4)) for m in (1, 2))
     with pytest.raises(InvalidTemplate, match="different dimensions"):
         SubspaceBatch.of([one, other])
 
@@ -210,7 +209,8 @@ def test_batch_indexes_like_a_list_of_templates():
     np.testing.assert_array_equal(batch[np.array([4, 0])].bases, batch.bases[[4, 0]])
     np.testing.assert_array_equal(SubspaceBatch.of(list(batch)).bases, batch.bases)
     np.testing.assert_allclose(batch.foot_norms, [t.foot_norm for t in batch])
-    np.testing.assert_allclose(batch.radii, [t.radius for t in batch])
+    with pytest.raises(ValueError, match="too many values"):
+        _ = batch.foot
     assert not batch.bases.flags.writeable
 
 
@@ -218,62 +218,4 @@ def test_numbers_do_not_show():
     stream = Keystream.seeded("show")
     batch = SubspaceBatch.through(units(stream, 2, 9), stream.normal((2, 3, 9)), stream=stream)
     assert repr(batch) == "SubspaceBatch(2 of n=9, m=3)"
-    assert repr(batch[0]) == "AffineSubspace(n=9, m=3)"
-    assert repr(batch[0].dual()) == "DualSubspace(n=9, m=3)"
-
-
-# --- dual form ---------------------------------------------------------------------------------
-
-
-def exact_pair(stream: Keystream, n: int, m: int, k: int) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Two sets in float64: foot points and orthonormal bases."""
-    pair = []
-    for dimension in (m, k):
-        basis = span_basis(stream.normal((1, dimension, n)))[0]
-        point = units(stream, 1, n)[0]
-        pair.append((point - basis.T @ (basis @ point), basis))
-    return pair
-
-
-@given(n=st.integers(2, 30), m_part=st.floats(0, 1), seed=st.integers(0, 10**6))
-def test_dual_and_primal_point_distances_agree(n: int, m_part: float, seed: int):
-    m = 1 + int(m_part * (n - 2))
-    stream = Keystream.seeded(seed)
-    (foot, basis), _ = exact_pair(stream, n, m, m)
-    points = stream.normal((4, n))
-    offsets = points - foot
-    primal = np.linalg.norm(offsets - offsets @ basis.T @ basis, axis=1)
-    dual = DualSubspace.of_primal(foot, basis)
-    np.testing.assert_allclose(dual.distance_to_points(points), primal, rtol=1e-10, atol=1e-10)
-    stored = AffineSubspace(foot, basis)
-    np.testing.assert_allclose(stored.dual().distance_to_points(points), primal, atol=1e-5)
-    np.testing.assert_allclose(
-        np.linalg.norm(points - stored.project(points), axis=1), primal, atol=1e-5
-    )
-
-
-@given(n=st.integers(6, 24), dims=st.tuples(st.floats(0, 1), st.floats(0, 1)), seed=st.integers(0))
-def test_dual_system_agrees_with_least_squares(n: int, dims: tuple[float, float], seed: int):
-    m, k = (1 + int(part * (n // 2 - 2)) for part in dims)  # m + k < n
-    (p, d), (q, e) = exact_pair(Keystream.seeded(seed), n, m, k)
-    both = np.vstack([d, e]).T
-    gap = q - p
-    primal = np.linalg.norm(gap - both @ scipy.linalg.lstsq(both, gap)[0])
-    dual = DualSubspace.of_primal(p, d).distance_to_subspace(DualSubspace.of_primal(q, e))
-    assert dual == pytest.approx(primal, rel=1e-10, abs=1e-10)
-
-
-def test_dual_system_decides_parallel_sets_that_do_not_meet():
-    p, d = np.array([0.0, 0, 0.5, 0, 0]), np.eye(2, 5)
-    q, e = np.array([0.0, 0, 0, 0.5, 0]), np.eye(1, 5)
-    distance = DualSubspace.of_primal(p, d).distance_to_subspace(DualSubspace.of_primal(q, e))
-    assert distance == pytest.approx(np.sqrt(0.5), rel=1e-12)
-
-
-def test_dual_system_is_refused_where_it_is_singular():
-    a, b = (DualSubspace.of_primal(p, d) for p, d in exact_pair(Keystream.seeded(1), 8, 5, 4))
-    with pytest.raises(TemplateError, match="use the primal form"):
-        a.distance_to_subspace(b)
-    c = DualSubspace.of_primal(np.zeros(9), np.eye(2, 9))
-    with pytest.raises(TemplateError, match="have no distance"):
-        a.distance_to_subspace(c)
+    assert repr(batch[0]) == "SubspaceBatch(1 of n=9, m=3)"

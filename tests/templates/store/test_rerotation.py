@@ -24,7 +24,7 @@ from templates.keys.randomness import Keystream
 from templates.keys.rotation import ROTATION_VERSION, SignedCosineRotation, TenantRotation
 from templates.keys.sealing import MasterKeyring
 from templates.space.lifting import Strategy, lift
-from templates.space.subspace import AffineSubspace, SubspaceBatch
+from templates.space.subspace import SubspaceBatch
 from templates.store import Attempt, Source, TemplateStore, UnknownTenant
 from templates.store.audit_log import By
 from templates.store.database import Database
@@ -82,7 +82,7 @@ class People:
 
     def encoded(
         self,
-        template: AffineSubspace,
+        template: SubspaceBatch,
         tenant: str,
         epoch: int,
         template_id: str,
