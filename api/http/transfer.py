@@ -17,11 +17,13 @@ header names its salt: the enrollment needs the same key after the import.
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
+from typing import ClassVar
 
 from api.http.errors import StartError
-from templates.contract.canonical import Fields, Json, canonical_json, parse_object
+from templates.contract.canonical import Json, canonical_json, parse_object
+from templates.contract.parsing import JsonValue
 from templates.errors import ContractError, ContractMismatch, InvalidTemplate, SealError
 from templates.keys.sealing import MasterKeyring
 from templates.store.identifiers import InvalidIdentifier
@@ -94,17 +96,27 @@ class Exported:
     holder_salt: str | None = None
 
 
+@dataclass(frozen=True)
+class _Header(JsonValue):
+    """What stands before the template."""
+
+    what: ClassVar[str] = "the export's header"
+
+    subject_id: str
+    contract_id: str
+    source: str
+    photos: int
+    holder_salt: str | None = None
+
+    def to_json(self) -> dict[str, Json]:
+        """JSON form, without a salt where no key is needed."""
+        return {name: value for name, value in super().to_json().items() if value is not None}
+
+
 def seal_export(exported: Exported, *, key: ExportKey, tenant: str) -> bytes:
     """Encrypt one subject."""
-    fields: dict[str, Json] = {
-        "subject_id": exported.subject_id,
-        "contract_id": exported.contract_id,
-        "source": exported.source,
-        "photos": exported.photos,
-    }
-    if exported.holder_salt is not None:
-        fields["holder_salt"] = exported.holder_salt
-    header = canonical_json(fields)
+    named = {entry.name: getattr(exported, entry.name) for entry in fields(_Header)}
+    header = canonical_json(_Header(**named).to_json())
     plain = len(header).to_bytes(LENGTH_BYTES, "big") + header + exported.wire
     sealed = key.keyring.seal(
         plain, purpose=PURPOSE, bound_to=key._bound_to(exported.contract_id, tenant)
@@ -149,17 +161,10 @@ def _parse(plain: bytes, contract_id: str) -> Exported:
     if not 0 < length <= MAX_HEADER_BYTES or len(plain) <= LENGTH_BYTES + length:
         raise InvalidTemplate("the export's header has an impossible length")
     try:
-        parsed = parse_object(plain[LENGTH_BYTES : LENGTH_BYTES + length], what="the header")
-        fields = Fields(parsed, what="the export's header")
-        exported = Exported(
-            subject_id=fields.text("subject_id"),
-            contract_id=fields.text("contract_id"),
-            source=fields.text("source"),
-            photos=fields.integer("photos"),
-            wire=plain[LENGTH_BYTES + length :],
-            holder_salt=fields.text("holder_salt") if "holder_salt" in parsed else None,
+        header = _Header.from_json(
+            parse_object(plain[LENGTH_BYTES : LENGTH_BYTES + length], what="the header")
         )
-        fields.done()
+        exported = Exported(**vars(header), wire=plain[LENGTH_BYTES + length :])
     except (ContractError, InvalidIdentifier) as error:
         raise InvalidTemplate(f"the export's header is broken: {error}") from None
     if exported.contract_id != contract_id:

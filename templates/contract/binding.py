@@ -3,9 +3,11 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
-from templates.contract.canonical import Fields, Json, digest, free_object
+from templates.contract.canonical import Json, digest, free_object
 from templates.contract.levels import SHA256_HEX
+from templates.contract.parsing import JsonValue
 from templates.errors import ContractError, ContractMismatch
 from templates.keys.rotation import ROTATION_VERSION
 from templates.space.lifting import Strategy
@@ -42,7 +44,7 @@ def embedding_id(*, embedder_sha256: str, preprocessing: Mapping[str, object]) -
 
 
 @dataclass(frozen=True)
-class Binding:
+class Binding(JsonValue):
     """What makes two templates comparable; its hash is the ``contract_id``.
 
     Parameters
@@ -63,6 +65,8 @@ class Binding:
     rotation_version
         Version of the derivation that turns stored templates.
     """
+
+    what: ClassVar[str] = "the binding"
 
     embedder_sha256: str
     preprocessing: Mapping[str, Json]
@@ -99,19 +103,6 @@ class Binding:
     def embedding_id(self) -> str:
         """:func:`embedding_id` of the contract's embedder and preprocessing."""
         return embedding_id(embedder_sha256=self.embedder_sha256, preprocessing=self.preprocessing)
-
-    def to_json(self) -> dict[str, Json]:
-        """JSON form: exactly what is hashed."""
-        return {
-            "embedder_sha256": self.embedder_sha256,
-            "preprocessing": dict(self.preprocessing),
-            "n": self.n,
-            "axes": self.axes,
-            "strategy": str(self.strategy),
-            "m": self.m,
-            "decoy_source_id": self.decoy_source_id,
-            "rotation_version": self.rotation_version,
-        }
 
     def require_embedder(
         self, *, embedder_sha256: str, preprocessing: Mapping[str, object], n: int
@@ -189,23 +180,3 @@ class Binding:
                 f"{what} belongs to the contract {contract_id[:16]}…, the service runs "
                 f"{self.contract_id[:16]}…; enroll or lift again under the service's contract"
             )
-
-    @classmethod
-    def from_json(cls, value: object) -> "Binding":
-        """Parse hostile JSON."""
-        fields = Fields(value, what="the binding")
-        strategy = fields.text("strategy")
-        if strategy not in list(Strategy):
-            raise ContractError(f"the strategy must be one of {[*map(str, Strategy)]}")
-        binding = cls(
-            embedder_sha256=fields.text("embedder_sha256"),
-            preprocessing=fields.free("preprocessing"),
-            n=fields.integer("n"),
-            axes=fields.integer("axes"),
-            strategy=Strategy(strategy),
-            m=fields.integer("m"),
-            decoy_source_id=fields.text("decoy_source_id"),
-            rotation_version=fields.text("rotation_version"),
-        )
-        fields.done()
-        return binding

@@ -9,11 +9,12 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping, Sequence
-from typing import TypeAlias
+
+from pydantic import JsonValue
 
 from templates.errors import ContractError
 
-Json: TypeAlias = "bool | int | float | str | list[Json] | dict[str, Json] | None"
+Json = JsonValue
 
 MAX_DEPTH = 12
 FREE_DEPTH = 4  # of an object of free content, which sits some levels down in its document
@@ -126,90 +127,3 @@ def parse_object(data: bytes, *, what: str) -> dict[str, object]:
     if not isinstance(parsed, dict):
         raise ContractError(f"{what} is not a JSON object")
     return parsed
-
-
-class Fields:
-    """Typed access to one parsed object; ``done`` refuses the keys that nobody asked for."""
-
-    def __init__(self, value: object, *, what: str) -> None:
-        if not isinstance(value, dict):
-            raise ContractError(f"{what} is not a JSON object")
-        self._entries: dict[str, object] = dict(value)
-        self._what = what
-
-    def take(self, key: str) -> object:
-        """Hand out one entry, once."""
-        if key not in self._entries:
-            raise ContractError(f"{self._what} lacks {key!r}")
-        return self._entries.pop(key)
-
-    def text(self, key: str) -> str:
-        """Hand out a text of at most ``MAX_STRING`` characters."""
-        value = self.take(key)
-        if not isinstance(value, str) or len(value) > MAX_STRING:
-            raise ContractError(f"{self._what}: {key!r} is not a short text")
-        return value
-
-    def boolean(self, key: str) -> bool:
-        """Hand out ``true`` or ``false``."""
-        value = self.take(key)
-        if not isinstance(value, bool):
-            raise ContractError(f"{self._what}: {key!r} is not true or false")
-        return value
-
-    def integer(self, key: str) -> int:
-        """Hand out an integer within ±2^53; ``true`` and ``1.0`` are not integers."""
-        value = self.take(key)
-        if isinstance(value, bool) or not isinstance(value, int) or abs(value) > 2**53:
-            raise ContractError(f"{self._what}: {key!r} is not an integer")
-        return value
-
-    def number(self, key: str) -> float:
-        """Hand out a finite number."""
-        value = self.take(key)
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise ContractError(f"{self._what}: {key!r} is not a number")
-        if isinstance(value, int) and abs(value) > 2**53:
-            raise ContractError(f"{self._what}: {key!r} is out of range")
-        if not math.isfinite(value):
-            raise ContractError(f"{self._what}: {key!r} is not finite")
-        return float(value)
-
-    def take_null(self, key: str) -> bool:
-        """Hand out an entry that is null; returns whether it was, and leaves any other."""
-        if key not in self._entries or self._entries[key] is not None:
-            return False
-        del self._entries[key]
-        return True
-
-    def numbers(self, key: str, count: int) -> tuple[float, ...]:
-        """Hand out a list of exactly ``count`` finite numbers."""
-        value = self.take(key)
-        if not isinstance(value, list) or len(value) != count:
-            raise ContractError(f"{self._what}: {key!r} is not a list of {count} numbers")
-        entries = Fields(dict(zip(map(str, range(count)), value, strict=True)), what=self._what)
-        return tuple(entries.number(str(i)) for i in range(count))
-
-    def lacks(self, key: str) -> bool:
-        """Whether an optional entry is not there, or was handed out."""
-        return key not in self._entries
-
-    def items(self, key: str, *, most: int) -> list[object]:
-        """Hand out a list of 1 to ``most`` values."""
-        value = self.take(key)
-        if not isinstance(value, list) or not 1 <= len(value) <= most:
-            raise ContractError(f"{self._what}: {key!r} is not a list of 1 to {most} values")
-        return value
-
-    def free(self, key: str) -> dict[str, Json]:
-        """Hand out an object of free content, bounded by ``free_object``."""
-        return free_object(self.take(key), what=f"{self._what}: {key!r}")
-
-    def remaining(self) -> dict[str, object]:
-        """Copy of the entries that were not handed out yet."""
-        return dict(self._entries)
-
-    def done(self) -> None:
-        """Refuse what is left: a key that this version does not know may change the meaning."""
-        if self._entries:
-            raise ContractError(f"{self._what} holds {len(self._entries)} unknown key(s)")

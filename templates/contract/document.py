@@ -16,9 +16,10 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import ClassVar
 
 from templates.contract.binding import Binding
-from templates.contract.canonical import Fields, Json, digest, free_object, parse_object
+from templates.contract.canonical import Json, digest, free_object, parse_object
 from templates.contract.levels import (
     LEVEL_NAME,
     Calibration,
@@ -26,10 +27,10 @@ from templates.contract.levels import (
     Mode,
     Rate,
     check_norm_range,
-    norm_range,
 )
 from templates.contract.liveness import LivenessCalibration
 from templates.contract.nobody import Nobody
+from templates.contract.parsing import JsonValue
 from templates.contract.verdict import Verdict
 from templates.decoys import DecoySource, client_source
 from templates.distances import Metric
@@ -55,7 +56,7 @@ MAX_CALIBRATIONS = 64
 
 
 @dataclass(frozen=True, eq=False)
-class Contract:
+class Contract(JsonValue):
     """A binding with its calibrations and limits, and the seed of the cohort.
 
     Parameters
@@ -88,6 +89,8 @@ class Contract:
     ContractError
         Where a part contradicts another one.
     """
+
+    what: ClassVar[str] = "the contract"
 
     binding: Binding
     recorded: Mapping[str, Json]
@@ -218,23 +221,17 @@ class Contract:
         wanted = f"{mode} {metric or 'any metric'} with probe m = {probe_m}"
         raise Uncalibrated(f"no calibration for {wanted}; calibrated are: {', '.join(have)}")
 
+    def to_json(self) -> dict[str, Json]:
+        """JSON form of everything but the seed of the cohort."""
+        facts = super().to_json() | {"contract_id": self.contract_id}
+        del facts["cohort_seed"]
+        if self.liveness is None:
+            del facts["liveness"]
+        return facts
+
     def public(self) -> dict[str, Json]:
         """Everything but the seed of the cohort, as JSON values."""
-        facts: dict[str, Json] = {
-            "contract_id": self.contract_id,
-            "binding": self.binding.to_json(),
-            "recorded": dict(self.recorded),
-            "calibrations": [entry.to_json() for entry in self.calibrations],
-            "default_level": self.default_level,
-            "photo_consistency": self.photo_consistency,
-            "probe_consistency": self.probe_consistency,
-            "template_foot_point_norm": list(self.template_foot_point_norm),
-            "template_stranger_similarity": self.template_stranger_similarity,
-            "verdict": None if self.verdict is None else self.verdict.to_json(),
-        }
-        if self.liveness is not None:
-            facts["liveness"] = self.liveness.to_json()
-        return facts
+        return self.to_json()
 
     def save(self, path: Path | str, sealer: Sealer) -> None:
         """Write the contract file atomically, readable by its owner only (mode 0600).
@@ -257,54 +254,28 @@ class Contract:
         SealError
             Where the sealed part does not open: another master key, or an edited file.
         """
-        fields = Fields(
-            parse_object(_read_bounded(Path(path)), what="the contract file"), what="it"
-        )
-        if fields.text("format") != FORMAT:
+        document = parse_object(_read_bounded(Path(path)), what="the contract file")
+        if document.get("format") != FORMAT:
             raise ContractError(f"the file is not a {FORMAT}")
-        if fields.integer("version") != VERSION:
+        if document.get("version") != VERSION:
             raise ContractError(
                 "the contract file was written by another version of this program: run "
                 "`veilface calibrate` again"
             )
-        text = fields.take("sealed")
-        if not isinstance(text, str):
-            raise ContractError("the contract file's sealed part is not base64 text")
-        document = {"format": FORMAT, "version": VERSION, **fields.remaining()}
-        binding = Binding.from_json(fields.take("binding"))
-        if fields.text("contract_id") != binding.contract_id:
-            raise ContractError("the contract_id is not the hash of the binding")
-        calibrations = tuple(
-            map(Calibration.from_json, fields.items("calibrations", most=MAX_CALIBRATIONS))
-        )
-        if not all(entry.calibration_id for entry in calibrations):
-            raise ContractError("a calibration has no calibration_id")
-        verdict = fields.take("verdict")
-        liveness = None if fields.lacks("liveness") else fields.take("liveness")
-        contract = cls(
-            binding=binding,
-            recorded=fields.free("recorded"),
-            calibrations=calibrations,
-            default_level=fields.text("default_level"),
-            photo_consistency=fields.number("photo_consistency"),
-            probe_consistency=fields.number("probe_consistency"),
-            template_foot_point_norm=norm_range(fields.take("template_foot_point_norm")),
-            template_stranger_similarity=fields.number("template_stranger_similarity"),
-            cohort_seed=_open_sealed(text, sealer, document),
-            verdict=None if verdict is None else Verdict.from_json(verdict),
-            liveness=None if liveness is None else LivenessCalibration.from_json(liveness),
-        )
-        fields.done()
-        return contract
+        seed = _open_sealed(document.pop("sealed", None), sealer, document)
+        del document["format"], document["version"]
+        return cls.from_json(document, cohort_seed=seed.hex())
 
 
 def _seal_context(document: Mapping[str, object]) -> str:
     """Context of the seal: the contract id and the digest of all that is not sealed."""
-    return f"contract-cohort:{document['contract_id']}:{digest(document)}"
+    return f"contract-cohort:{document.get('contract_id')}:{digest(document)}"
 
 
-def _open_sealed(text: str, sealer: Sealer, document: Mapping[str, object]) -> bytes:
+def _open_sealed(text: object, sealer: Sealer, document: Mapping[str, object]) -> bytes:
     try:
+        if not isinstance(text, str):
+            raise ValueError("no text")
         sealed = base64.b64decode(text, validate=True)
     except (binascii.Error, ValueError):
         raise ContractError("the contract file's sealed part is not base64 text") from None

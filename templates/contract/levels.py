@@ -4,9 +4,12 @@ import math
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal, TypeAlias, cast, get_args
+from typing import Annotated, ClassVar, Literal, TypeAlias, get_args
 
-from templates.contract.canonical import Fields, Json, digest, free_object
+from pydantic import Field
+
+from templates.contract.canonical import Json, digest, free_object
+from templates.contract.parsing import JsonValue
 from templates.distances import Metric
 from templates.errors import ContractError, Uncalibrated
 
@@ -30,7 +33,7 @@ def photos_in_words(count: int) -> str:
 
 
 @dataclass(frozen=True)
-class Rate:
+class Rate(JsonValue):
     """An error rate as it was counted, with its 95 % interval.
 
     Parameters
@@ -43,6 +46,8 @@ class Rate:
         How the bounds were computed: ``wilson`` takes trials as independent;
         ``subject-bootstrap`` resamples people, since trials share them.
     """
+
+    what: ClassVar[str] = "a rate"
 
     errors: int
     trials: int
@@ -63,33 +68,9 @@ class Rate:
         """Errors over trials; 0 where nothing was tried."""
         return self.errors / self.trials if self.trials else 0.0
 
-    def to_json(self) -> dict[str, Json]:
-        """JSON form."""
-        return {
-            "errors": self.errors,
-            "trials": self.trials,
-            "ci_low": self.ci_low,
-            "ci_high": self.ci_high,
-            "interval": self.interval,
-        }
-
-    @classmethod
-    def from_json(cls, value: object) -> "Rate":
-        """Parse hostile JSON."""
-        fields = Fields(value, what="a rate")
-        rate = cls(
-            errors=fields.integer("errors"),
-            trials=fields.integer("trials"),
-            ci_low=fields.number("ci_low"),
-            ci_high=fields.number("ci_high"),
-            interval=cast(Interval, fields.text("interval")),
-        )
-        fields.done()
-        return rate
-
 
 @dataclass(frozen=True)
-class GroupRates:
+class GroupRates(JsonValue):
     """Error rates within one group of people, at a level's threshold (ISO/IEC 19795-10).
 
     Parameters
@@ -105,6 +86,8 @@ class GroupRates:
         Whether there were trials enough to judge the rate by.
     """
 
+    what: ClassVar[str] = "the rates of a group"
+
     attribute: str
     group: str
     fmr: Rate
@@ -114,32 +97,6 @@ class GroupRates:
 
     def __post_init__(self) -> None:
         check_group_names((self.attribute, self.group))
-
-    def to_json(self) -> dict[str, Json]:
-        """JSON form."""
-        return {
-            "attribute": self.attribute,
-            "group": self.group,
-            "fmr": self.fmr.to_json(),
-            "frr": self.frr.to_json(),
-            "fmr_judged": self.fmr_judged,
-            "frr_judged": self.frr_judged,
-        }
-
-    @classmethod
-    def from_json(cls, value: object) -> "GroupRates":
-        """Parse hostile JSON."""
-        fields = Fields(value, what="the rates of a group")
-        rates = cls(
-            attribute=fields.text("attribute"),
-            group=fields.text("group"),
-            fmr=Rate.from_json(fields.take("fmr")),
-            frr=Rate.from_json(fields.take("frr")),
-            fmr_judged=fields.boolean("fmr_judged"),
-            frr_judged=fields.boolean("frr_judged"),
-        )
-        fields.done()
-        return rates
 
 
 def check_group_names(names: Iterable[str]) -> None:
@@ -153,7 +110,7 @@ def check_group_names(names: Iterable[str]) -> None:
 
 
 @dataclass(frozen=True)
-class Level:
+class Level(JsonValue):
     """A security level: its threshold, and the errors seen on the calibration data.
 
     A probe is accepted where its score reaches ``threshold``: the similarity less what is expected
@@ -179,9 +136,11 @@ class Level:
         Rates by group of people; empty where nobody was labelled.
     """
 
+    what: ClassVar[str] = "a level"
+
     name: str
     target_fmr: float | None
-    threshold: float
+    threshold: Annotated[float, Field(alias="score_threshold")]
     fmr: Rate
     fnmr: Rate
     fnmr_by_photos: Mapping[int, Rate] = field(default_factory=dict)
@@ -204,54 +163,16 @@ class Level:
 
     def to_json(self) -> dict[str, Json]:
         """JSON form; without ``frr_by_photos`` and ``groups`` where they are empty."""
-        value: dict[str, Json] = {
-            "name": self.name,
-            "target_fmr": self.target_fmr,
-            "score_threshold": self.threshold,
-            "fmr": self.fmr.to_json(),
-            "fnmr": self.fnmr.to_json(),
-            "fnmr_by_photos": _json_by_photos(self.fnmr_by_photos),
-        }
-        if self.frr_by_photos:
-            value["frr_by_photos"] = _json_by_photos(self.frr_by_photos)
-        if self.groups:
-            value["groups"] = [entry.to_json() for entry in self.groups]
+        value = super().to_json()
+        value["score_threshold"] = value.pop("threshold")
+        for name in ("frr_by_photos", "groups"):
+            if not value[name]:
+                del value[name]
         return value
-
-    @classmethod
-    def from_json(cls, value: object) -> "Level":
-        """Parse hostile JSON."""
-        fields = Fields(value, what="a level")
-        groups = [] if fields.lacks("groups") else fields.items("groups", most=MAX_GROUPS)
-        level = cls(
-            name=fields.text("name"),
-            target_fmr=None if fields.take_null("target_fmr") else fields.number("target_fmr"),
-            threshold=fields.number("score_threshold"),
-            fmr=Rate.from_json(fields.take("fmr")),
-            fnmr=Rate.from_json(fields.take("fnmr")),
-            fnmr_by_photos=_rates_by_photos(fields, "fnmr_by_photos"),
-            frr_by_photos={}
-            if fields.lacks("frr_by_photos")
-            else _rates_by_photos(fields, "frr_by_photos"),
-            groups=tuple(map(GroupRates.from_json, groups)),
-        )
-        fields.done()
-        return level
-
-
-def _json_by_photos(rates: Mapping[int, Rate]) -> dict[str, Json]:
-    return {str(photos): rate.to_json() for photos, rate in rates.items()}
-
-
-def _rates_by_photos(fields: Fields, key: str) -> dict[int, Rate]:
-    value = fields.take(key)
-    if not isinstance(value, dict) or not all(re.fullmatch("[1-9]|10", name) for name in value):
-        raise ContractError(f"{key} is not an object whose keys are numbers of photos")
-    return {int(photos): Rate.from_json(rate) for photos, rate in value.items()}
 
 
 @dataclass(frozen=True)
-class Calibration:
+class Calibration(JsonValue):
     """Thresholds of one (mode, metric, probe m, probe photos) of a contract.
 
     Parameters
@@ -275,6 +196,8 @@ class Calibration:
     calibration_id
         SHA-256 of all of the above and the contract id; empty until ``identified``.
     """
+
+    what: ClassVar[str] = "a calibration"
 
     mode: Mode
     metric: Metric
@@ -339,49 +262,6 @@ class Calibration:
         del body["calibration_id"]
         bound: dict[str, Json] = {"calibration": body, "contract_id": contract_id}
         return replace(self, calibration_id=digest(bound))
-
-    def to_json(self) -> dict[str, Json]:
-        """JSON form."""
-        return {
-            "mode": self.mode,
-            "metric": str(self.metric),
-            "probe_m": self.probe_m,
-            "probe_photos": self.probe_photos,
-            "steps": self.steps,
-            "levels": [level.to_json() for level in self.levels],
-            "foot_point_norm": list(self.foot_point_norm) if self.foot_point_norm else None,
-            "calibrated_on": dict(self.calibrated_on),
-            "calibration_id": self.calibration_id,
-        }
-
-    @classmethod
-    def from_json(cls, value: object) -> "Calibration":
-        """Parse hostile JSON; the contract recomputes the id."""
-        fields = Fields(value, what="a calibration")
-        norms = fields.take("foot_point_norm")
-        metric = fields.text("metric")
-        if metric not in list(Metric):
-            raise ContractError(f"a calibration's metric must be one of {[*map(str, Metric)]}")
-        calibration = cls(
-            mode=cast(Mode, fields.text("mode")),
-            metric=Metric(metric),
-            probe_m=fields.integer("probe_m"),
-            probe_photos=fields.integer("probe_photos"),
-            steps=fields.integer("steps"),
-            levels=tuple(map(Level.from_json, fields.items("levels", most=MAX_LEVELS))),
-            foot_point_norm=None if norms is None else norm_range(norms),
-            calibrated_on=fields.free("calibrated_on"),
-            calibration_id=fields.text("calibration_id"),
-        )
-        fields.done()
-        return calibration
-
-
-def norm_range(value: object) -> tuple[float, float]:
-    """Parse a range of foot-point norms from hostile JSON."""
-    low, high = Fields({"range": value}, what="a range of foot-point norms").numbers("range", 2)
-    check_norm_range((low, high))
-    return low, high
 
 
 def check_norm_range(norms: tuple[float, float]) -> None:

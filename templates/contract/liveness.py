@@ -8,9 +8,11 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import ClassVar
 
-from templates.contract.canonical import Fields, Json, free_object
+from templates.contract.canonical import Json, free_object
 from templates.contract.levels import SHA256_HEX, Rate
+from templates.contract.parsing import JsonValue
 from templates.errors import ContractError, Uncalibrated
 
 MAX_LIVENESS_GRAPHS = 8
@@ -19,7 +21,7 @@ SPECIES_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._+-]{0,63}")
 
 
 @dataclass(frozen=True)
-class LivenessCalibration:
+class LivenessCalibration(JsonValue):
     """A threshold of passive presentation attack detection (ISO/IEC 30107-3).
 
     A photo is taken for live where its score is at or above the threshold.
@@ -40,6 +42,8 @@ class LivenessCalibration:
     calibrated_on
         The photos: names, counts, those without a face.
     """
+
+    what: ClassVar[str] = "the liveness calibration"
 
     graphs: tuple[str, ...]
     threshold: float
@@ -66,7 +70,7 @@ class LivenessCalibration:
                 f"attack species are at most {MAX_SPECIES}, with names that match "
                 f"{SPECIES_NAME.pattern}"
             )
-        object.__setattr__(self, "apcer", dict(self.apcer))
+        object.__setattr__(self, "apcer", dict(sorted(self.apcer.items())))
         stated = free_object(self.calibrated_on, what="what liveness was calibrated on")
         object.__setattr__(self, "calibrated_on", stated)
 
@@ -92,33 +96,3 @@ class LivenessCalibration:
                 "the contract's liveness threshold belongs to other liveness graphs, or to another "
                 "pack.toml, than the pack's: run `veilface calibrate --liveness` with this pack"
             )
-
-    def to_json(self) -> dict[str, Json]:
-        """JSON form."""
-        return {
-            "graphs": list(self.graphs),
-            "threshold": self.threshold,
-            "bpcer": self.bpcer.to_json(),
-            "target_bpcer": self.target_bpcer,
-            "apcer": {name: rate.to_json() for name, rate in sorted(self.apcer.items())},
-            "calibrated_on": dict(self.calibrated_on),
-        }
-
-    @classmethod
-    def from_json(cls, value: object) -> "LivenessCalibration":
-        """Parse hostile JSON."""
-        fields = Fields(value, what="the liveness calibration")
-        graphs = fields.items("graphs", most=MAX_LIVENESS_GRAPHS)
-        apcer = fields.take("apcer")
-        if not isinstance(apcer, dict) or len(apcer) > MAX_SPECIES:
-            raise ContractError(f"the APCER is not an object of at most {MAX_SPECIES} species")
-        calibration = cls(
-            graphs=tuple(map(str, graphs)),
-            threshold=fields.number("threshold"),
-            bpcer=Rate.from_json(fields.take("bpcer")),
-            target_bpcer=fields.number("target_bpcer"),
-            apcer={name: Rate.from_json(rate) for name, rate in apcer.items()},
-            calibrated_on=fields.free("calibrated_on"),
-        )
-        fields.done()
-        return calibration

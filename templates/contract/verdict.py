@@ -3,12 +3,13 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal, TypeAlias
+from typing import ClassVar, Literal, TypeAlias
 
 import numpy as np
 
-from templates.contract.canonical import Fields, Json, free_object
+from templates.contract.canonical import Json, free_object
 from templates.contract.levels import Rate
+from templates.contract.parsing import JsonValue
 from templates.errors import ContractError
 
 Status: TypeAlias = Literal["PASS", "FAIL", "NOT SHOWN"]
@@ -37,7 +38,7 @@ def upper_bound(errors: int, trials: int, *, confidence: float = CONFIDENCE) -> 
 
 
 @dataclass(frozen=True)
-class Judgement:
+class Judgement(JsonValue):
     """A measured rate against its limit.
 
     Parameters
@@ -55,6 +56,8 @@ class Judgement:
         What the data were too few for, or the attacks do not cover, in a sentence; such a rate
         shows nothing.
     """
+
+    what: ClassVar[str] = "a verdict"
 
     rate: Rate
     limit: float
@@ -97,41 +100,12 @@ class Judgement:
 
     def to_json(self) -> dict[str, Json]:
         """JSON form; ``status``, ``value`` and ``upper`` follow from the rest, for readers."""
-        return {
-            "status": self.status,
-            "value": self.rate.value,
-            "limit": self.limit,
-            "upper": self.upper,
-            "bound": self.bound,
-            "rate": self.rate.to_json(),
-            "basis": dict(self.basis),
-            "shortfall": self.shortfall,
-        }
-
-    @classmethod
-    def from_json(cls, value: object) -> "Judgement":
-        """Parse hostile JSON."""
-        fields = Fields(value, what="a verdict")
-        judgement = cls(
-            rate=Rate.from_json(fields.take("rate")),
-            limit=fields.number("limit"),
-            basis=fields.free("basis"),
-            shortfall=None if fields.take_null("shortfall") else fields.text("shortfall"),
-            bound=None if fields.take_null("bound") else fields.number("bound"),
-        )
-        if fields.text("status") != judgement.status:
-            raise ContractError("a verdict's status does not follow from its rate and limit")
-        if fields.number("value") != judgement.rate.value:
-            raise ContractError("a verdict's value is not that of its rate")
-        upper = None if fields.take_null("upper") else fields.number("upper")
-        if upper != judgement.upper:
-            raise ContractError("a verdict's upper bound is not that of its rate")
-        fields.done()
-        return judgement
+        derived = {"status": self.status, "value": self.rate.value, "upper": self.upper}
+        return super().to_json() | derived
 
 
 @dataclass(frozen=True)
-class Verdict:
+class Verdict(JsonValue):
     """Whether a contract is private, whether it is accurate, and whether it is so for every group.
 
     Parameters
@@ -146,27 +120,12 @@ class Verdict:
         where that was not measured.
     """
 
+    what: ClassVar[str] = "the verdict"
+
     privacy: Judgement
     accuracy: Judgement | None = None
     groups: Judgement | None = None
 
     def to_json(self) -> dict[str, Json]:
         """JSON form, without what was not measured."""
-        value: dict[str, Json] = {"privacy": self.privacy.to_json()}
-        if self.accuracy is not None:
-            value["accuracy"] = self.accuracy.to_json()
-        if self.groups is not None:
-            value["groups"] = self.groups.to_json()
-        return value
-
-    @classmethod
-    def from_json(cls, value: object) -> "Verdict":
-        """Parse hostile JSON."""
-        fields = Fields(value, what="the verdict")
-        accuracy, groups = (
-            None if fields.lacks(name) else Judgement.from_json(fields.take(name))
-            for name in ("accuracy", "groups")
-        )
-        verdict = cls(Judgement.from_json(fields.take("privacy")), accuracy, groups)
-        fields.done()
-        return verdict
+        return {name: value for name, value in super().to_json().items() if value is not None}
