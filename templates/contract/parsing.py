@@ -46,7 +46,8 @@ class JsonValue:
         if not isinstance(given, dict):
             raise ContractError(f"{cls.what} is not a JSON object")
         try:
-            made: Self = _adapter(cls).validate_json(canonical_json({**given, **unwritten}))
+            text = canonical_json({**given, **unwritten})
+            made: Self = _adapter(cls).validate_json(text)  # type: ignore[arg-type]
         except ValidationError as error:
             # Its own text quotes the input.
             first = error.errors(include_input=False, include_url=False, include_context=False)[0]

@@ -1,20 +1,19 @@
 """The bytes of a private template on the wire and, sealed, in the store (docs/formats.md).
 
-The container is safetensors. The decoder treats its input as hostile: it bounds the size, reads
-the header itself and compares it with the only headers there can be, before the library sees it.
+The container is safetensors. The decoder treats its input as hostile: it bounds the size, and
+compares the header with the only ones that there can be, before it looks at a number.
 """
 
 import json
 import re
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple, NoReturn
+from typing import Any, Literal, NoReturn
 
 import numpy as np
-import safetensors.numpy
 from numpy.typing import NDArray
-from safetensors import SafetensorError
 
-from templates.errors import InvalidTemplate, LiftingError
+from templates.contract.canonical import parse_object
+from templates.errors import ContractError, InvalidTemplate, LiftingError
 from templates.space.subspace import SubspaceBatch, span_basis
 
 FORMAT = "veilface-template"
@@ -40,15 +39,6 @@ class WireTemplate:
     subspace: SubspaceBatch = field(repr=False)
     contract_id: str
     dtype: WireDtype
-
-
-class _Layout(NamedTuple):
-    """What a checked header says."""
-
-    dtype: WireDtype
-    contract_id: str
-    n: int
-    m: int
 
 
 def encode(subspace: SubspaceBatch, *, contract_id: str, dtype: WireDtype = "float16") -> bytes:
@@ -109,14 +99,12 @@ def decode(
     InvalidTemplate
         Anything is not exactly as in docs/formats.md. The message gives the reason.
     """
-    layout, foot, basis = _numbers(data, max_n, max_m)
+    contract_id, dtype, foot, basis = _numbers(data, max_n, max_m)
     # Before the cast, which NumPy warns of for a signalling NaN.
     if not (np.isfinite(foot).all() and np.isfinite(basis).all()):
         _refuse("a number is not finite")
-    subspace = _canonical(
-        foot.astype(np.float64), basis.astype(np.float64), TOLERANCES[layout.dtype]
-    )
-    return WireTemplate(subspace, layout.contract_id, layout.dtype)
+    subspace = _canonical(foot.astype(np.float64), basis.astype(np.float64), TOLERANCES[dtype])
+    return WireTemplate(subspace, contract_id, dtype)
 
 
 def decode_as_stored(
@@ -133,25 +121,57 @@ def decode_as_stored(
     InvalidTemplate
         The container is not exactly as in docs/formats.md.
     """
-    layout, foot, basis = _numbers(data, max_n, max_m)
+    contract_id, dtype, foot, basis = _numbers(data, max_n, max_m)
     subspace = SubspaceBatch(foot.astype(np.float32), basis.astype(np.float32))
-    return WireTemplate(subspace, layout.contract_id, layout.dtype)
+    return WireTemplate(subspace, contract_id, dtype)
 
 
 def _numbers(
     data: bytes | bytearray | memoryview, max_n: int, max_m: int
-) -> tuple[_Layout, NDArray[np.floating], NDArray[np.floating]]:
-    """Read what a container says, foot point and basis."""
+) -> tuple[str, WireDtype, NDArray[np.floating], NDArray[np.floating]]:
+    """Read contract id, dtype, foot point and basis, as they stand in the bytes."""
     view = memoryview(data)
     if view.nbytes > size_limit(max_n, max_m):
         _refuse(f"more than {size_limit(max_n, max_m)} bytes")
     raw = view.tobytes()
-    layout = _read_header(raw, max_n, max_m)
+    length = int.from_bytes(raw[:_LENGTH_BYTES], "little")
+    start = _LENGTH_BYTES + length
+    if len(raw) < _LENGTH_BYTES or length > MAX_HEADER_BYTES:
+        _refuse(f"no header of at most {MAX_HEADER_BYTES} bytes")
+    if start > len(raw):
+        _refuse("truncated inside the header")
+    header = raw[_LENGTH_BYTES:start]
+    if not header.startswith(b"{"):
+        _refuse("the header is not a JSON object")
     try:
-        tensors = safetensors.numpy.load(raw)
-    except SafetensorError:
-        raise InvalidTemplate("template refused: not a safetensors container") from None
-    return layout, tensors["foot"], tensors["basis"]
+        given: Any = parse_object(header, what="the header")
+        m, n = given["basis"]["shape"]
+        dtype, contract_id = _DTYPES[given["foot"]["dtype"]], given["__metadata__"]["contract_id"]
+    except ContractError as error:
+        raise InvalidTemplate(f"template refused: {error}") from None
+    except (KeyError, TypeError, ValueError):
+        _refuse("the header has not the members of a template of F16 or F32 numbers")
+    if not all(type(size) is int for size in (n, m)):
+        _refuse("a dimension is not an integer")
+    if not (2 <= n <= max_n and 1 <= m <= max_m and m < n):
+        _refuse(f"dimensions out of range: 2 <= n <= {max_n}, 1 <= m <= {max_m}, m < n")
+    if not isinstance(contract_id, str) or not _CONTRACT_ID.fullmatch(contract_id):
+        _refuse("the contract id is malformed")
+    # There are two headers that say this, but for the order of members: foot or basis first. The
+    # text is compared, because true and 1.0 are 1.
+    said = json.dumps(given, sort_keys=True)
+    for foot_first in (True, False):
+        fields = _fields(n, m, dtype, contract_id, foot_first=foot_first)
+        if said == json.dumps(fields, sort_keys=True):
+            break
+    else:
+        _refuse("the header is not that of a template of these dimensions")
+    payload = raw[start:]
+    if len(payload) != np.dtype(dtype).itemsize * n * (m + 1):
+        _refuse("the tensors do not fill the payload exactly")
+    numbers = np.frombuffer(payload, dtype=np.dtype(dtype).newbyteorder("<"))
+    foot, basis = (numbers[:n], numbers[n:]) if foot_first else (numbers[n * m :], numbers[: n * m])
+    return contract_id, dtype, foot, basis.reshape(m, n)
 
 
 def _canonical(
@@ -192,96 +212,27 @@ def _orthonormal(basis: NDArray[np.float64], gram: NDArray[np.float64]) -> NDArr
         raise InvalidTemplate("template refused: the basis is linearly dependent") from None
 
 
+def _fields(
+    n: int, m: int, dtype: WireDtype, contract_id: str, *, foot_first: bool = True
+) -> dict[str, Any]:
+    """What a header says."""
+    size = np.dtype(dtype).itemsize
+    split, end = size * n * (1 if foot_first else m), size * n * (m + 1)
+    first, second = [0, split], [split, end]
+    of_foot, of_basis = (first, second) if foot_first else (second, first)
+    return {
+        "__metadata__": {"format": FORMAT, "version": VERSION, "contract_id": contract_id},
+        "foot": {"dtype": _CODES[dtype], "shape": [n], "data_offsets": of_foot},
+        "basis": {"dtype": _CODES[dtype], "shape": [m, n], "data_offsets": of_basis},
+    }
+
+
 def _header(n: int, m: int, dtype: WireDtype, contract_id: str) -> bytes:
     """Length and JSON header, padded with spaces to a multiple of eight bytes."""
-    size = np.dtype(dtype).itemsize
-    split, end = size * n, size * n * (m + 1)
-    fields = {
-        "__metadata__": {"format": FORMAT, "version": VERSION, "contract_id": contract_id},
-        "foot": {"dtype": _CODES[dtype], "shape": [n], "data_offsets": [0, split]},
-        "basis": {"dtype": _CODES[dtype], "shape": [m, n], "data_offsets": [split, end]},
-    }
+    fields = _fields(n, m, dtype, contract_id)
     text = json.dumps(fields, separators=(",", ":")).encode("ascii")
     text += b" " * (-len(text) % 8)
     return len(text).to_bytes(_LENGTH_BYTES, "little") + text
-
-
-def _read_header(raw: bytes, max_n: int, max_m: int) -> _Layout:
-    length = int.from_bytes(raw[:_LENGTH_BYTES], "little")
-    if len(raw) < _LENGTH_BYTES or length > MAX_HEADER_BYTES:
-        _refuse(f"no header of at most {MAX_HEADER_BYTES} bytes")
-    start = _LENGTH_BYTES + length
-    if start > len(raw):
-        _refuse("truncated inside the header")
-    fields = _parse(raw[_LENGTH_BYTES:start])
-    metadata, foot, basis = _members(fields, "__metadata__", "foot", "basis")
-    form, version, contract_id = _members(metadata, "format", "version", "contract_id")
-    if form != FORMAT or version != VERSION:
-        _refuse(f"not the format {FORMAT} version {VERSION}")
-    if not isinstance(contract_id, str) or not _CONTRACT_ID.fullmatch(contract_id):
-        _refuse("the contract id is malformed")
-    foot_dtype, foot_shape, foot_range = _tensor(foot, axes=1)
-    basis_dtype, (m, n), basis_range = _tensor(basis, axes=2)
-    if foot_dtype != basis_dtype or foot_shape != (n,):
-        _refuse("foot point and basis do not fit each other")
-    if not (2 <= n <= max_n and 1 <= m <= max_m and m < n):
-        _refuse(f"dimensions out of range: 2 <= n <= {max_n}, 1 <= m <= {max_m}, m < n")
-    size = np.dtype(foot_dtype).itemsize
-    small, large = size * n, size * n * m
-    end = small + large
-    layouts = (((0, small), (small, end)), ((large, end), (0, large)))
-    if (foot_range, basis_range) not in layouts or len(raw) - start != end:
-        _refuse("the tensors do not fill the payload exactly")
-    return _Layout(foot_dtype, contract_id, n, m)
-
-
-def _tensor(value: object, *, axes: int) -> tuple[WireDtype, tuple[int, ...], tuple[int, ...]]:
-    code, shape, offsets = _members(value, "dtype", "shape", "data_offsets")
-    if not isinstance(code, str) or code not in _DTYPES:
-        _refuse("numbers must be F16 or F32")
-    return _DTYPES[code], _integers(shape, axes), _integers(offsets, 2)
-
-
-def _integers(value: object, count: int) -> tuple[int, ...]:
-    if not isinstance(value, list) or len(value) != count:
-        _refuse("a shape or an offset pair has the wrong length")
-    # bool is a subclass of int, and `true` is no dimension.
-    if not all(type(item) is int and 0 <= item < 2**48 for item in value):
-        _refuse("a shape or an offset is not an integer in range")
-    return tuple(value)
-
-
-def _members(value: object, *names: str) -> list[Any]:
-    """Return the members of a JSON object that must have exactly these names."""
-    if not isinstance(value, dict) or set(value) != set(names):
-        _refuse(f"the header must have exactly the members {', '.join(names)}")
-    return [value[name] for name in names]
-
-
-def _parse(header: bytes) -> object:
-    if not header.startswith(b"{"):
-        _refuse("the header is not a JSON object")
-    try:
-        return json.loads(
-            header.decode("utf-8"),
-            object_pairs_hook=_without_duplicates,
-            parse_float=_no_number,
-            parse_constant=_no_number,
-        )
-    except (ValueError, RecursionError):
-        # Not chained: the error of the parser quotes the input.
-        raise InvalidTemplate("template refused: the header is not JSON") from None
-
-
-def _without_duplicates(pairs: list[tuple[str, object]]) -> dict[str, object]:
-    members = dict(pairs)
-    if len(members) != len(pairs):
-        _refuse("the header names a member twice")
-    return members
-
-
-def _no_number(_text: str) -> NoReturn:
-    _refuse("the header holds a number that is not an integer")
 
 
 def _refuse(reason: str) -> NoReturn:
