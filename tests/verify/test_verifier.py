@@ -172,7 +172,7 @@ def test_unknown_subject_is_rejected_by_the_same_work(
     assert changed == {"accepted", "reason", "similarity", "distance", "score"}
     # Even a probe that lies in the stand-in is rejected.
     template = wire.decode(stand_in.wire).subspace
-    inside = unit((template.foot + template.radius * template.basis[0])[None])
+    inside = unit((template.foot + template.radii[0] * template.basis[0])[None])
     inside = unit(ROTATION.of(stand_in.template_id).turned_back(inside.astype(np.float64)))
     caught = verifier.decide_embedding(embeddings_of(inside)[0], stand_in)
     assert caught.similarity > 0.99
