@@ -71,7 +71,7 @@ def make_folder(path: Path) -> None:
 
 
 def refuse_another_users(path: Path) -> None:
-    """Refuse to work as root on a file, or in a folder, that another user owns.
+    """Refuse to work as root on a file, a link or in a folder that another user owns.
 
     Raises
     ------
@@ -80,8 +80,8 @@ def refuse_another_users(path: Path) -> None:
     """
     if os.geteuid() != 0:
         return
-    existing = next(place for place in (path, *path.parents) if place.exists())
-    owner = existing.stat().st_uid
+    existing = next(place for place in (path, *path.parents) if os.path.lexists(place))
+    owner = existing.lstat().st_uid
     if owner != 0:
         try:
             name = f"{pwd.getpwuid(owner).pw_name} ({owner})"
@@ -159,6 +159,7 @@ def _write(
     try:
         if target.exists() and not target.is_file():
             raise OSError(errno.EINVAL, "it is there and no regular file: name another one")
+        refuse_another_users(path)  # a link of theirs may lead to a file of root's
         refuse_another_users(target)
         target.parent.mkdir(mode=0o700 if mode == 0o600 else 0o777, parents=True, exist_ok=True)
         descriptor, name = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
