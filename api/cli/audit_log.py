@@ -50,11 +50,12 @@ def verify(
     """Check the audit log, and keys and lockouts against it; exit status 1 if anything is wrong.
 
     Names the first line that was altered, removed, added or moved. Where the log is whole, names
-    API keys that were made up, altered or put back after they ended, and counts of failed attempts
-    that were lowered. What the lines of an archive told is not looked at.
+    API keys that were made up, altered or put back after they ended, erased enrollments that were
+    put back, and counts of failed attempts that were lowered. What the lines of an archive told is
+    not looked at.
 
-    Needs: the database and its master key: whoever can write the database but has no master key can
-    write no line. The service may run meanwhile.
+    Needs: the database and its master key: an attacker who can write the database but has no
+    master key can write no line. The service may run meanwhile.
 
     Example: `veilface audit-log verify --anchor head.txt`
     """

@@ -16,10 +16,11 @@ from templates.store.api_keys import ApiKey, ApiKeys
 from templates.store.attempts import COUNT_RETENTION
 from templates.store.audit_log import TENANT_ERASE, Anchor, AuditLog, Verification
 from templates.store.context import StoreContext
-from templates.store.schema import FailedAttemptsRow
+from templates.store.schema import FailedAttemptsRow, SubjectRow, TenantRow
 
 KEY_ALTERED = "the row of an API key was made up or altered"
 KEY_PUT_BACK = "an API key that was revoked, replaced or erased was put back"
+ENROLLMENT_PUT_BACK = "an enrollment that was erased was put back"
 COUNT_LIFTED = "a count of failed attempts was lowered or removed"
 
 # Named, because a refused call leaves a line too, with the same action and its error code.
@@ -47,12 +48,14 @@ class _Failures:
 
 @dataclass
 class _Told:
-    """What the lines of the log tell of keys and failures, up to the last one that was read."""
+    """What the lines of the log tell, up to the last one that was read."""
 
     ended_keys: set[str] = field(default_factory=set)
     replaced_keys: dict[str, datetime] = field(default_factory=dict)
     keys_of_tenants: dict[str, set[str]] = field(default_factory=dict)
     failures: dict[str, _Failures] = field(default_factory=dict)
+    enrolled: dict[str, str] = field(default_factory=dict)
+    erased: set[str] = field(default_factory=set)
 
     def read(self, line: Mapping[str, Any]) -> None:
         """Take note of a line."""
@@ -68,10 +71,16 @@ class _Told:
                 self.replaced_keys[prefix] = min(until, self.replaced_keys.get(prefix, until))
         elif action == TENANT_ERASE and outcome == "erased":
             self.ended_keys |= self.keys_of_tenants.pop(tenant, set())
+            self.erased |= {each for each, owner in self.enrolled.items() if owner == tenant}
             for pseudonym in [p for p, f in self.failures.items() if f.tenant == tenant]:
                 del self.failures[pseudonym]
+        elif action in ("enroll", "import") and outcome in ("created", "replaced"):
+            self.enrolled[line["pseudonym"]] = tenant
+            self.erased.discard(line["pseudonym"])
         elif (action, outcome) in _REMOVES_COUNT:
             self.failures.pop(line["pseudonym"], None)
+            if self.enrolled.pop(line["pseudonym"], None):
+                self.erased.add(line["pseudonym"])
         elif action == "verify" and outcome == "reject":
             self._count(line["pseudonym"], tenant, datetime.fromisoformat(line["at"]))
         elif (action, outcome) in _ENDS_FAILURES and line["pseudonym"] in self.failures:
@@ -93,7 +102,7 @@ def verify_log_and_records(
     anchor: Anchor | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> tuple[Verification, tuple[RecordProblem, ...]]:
-    """Walk over the audit log, and hold keys and counts against what it tells.
+    """Walk over the audit log, and hold keys, enrollments and counts against it.
 
     Parameters
     ----------
@@ -115,7 +124,11 @@ def verify_log_and_records(
         # No other write runs now, so no line is younger than a row.
         for line in log.lines_after(connection, verification.head):
             told.read(line)
-        return (*_keys(told, api_keys, connection), *_counts(told, context, connection))
+        return (
+            *_keys(told, api_keys, connection),
+            *_enrollments(told, context, connection),
+            *_counts(told, context, connection),
+        )
 
     return verification, context.database.write(work)
 
@@ -135,6 +148,14 @@ def _is_back(told: _Told, key: ApiKey) -> bool:
         return True
     ends = told.replaced_keys.get(key.prefix)
     return ends is not None and (key.expires_at is None or key.expires_at > ends)
+
+
+def _enrollments(told: _Told, context: StoreContext, connection: Connection) -> list[RecordProblem]:
+    query = sa.select(TenantRow.name, SubjectRow.subject_id).join(
+        TenantRow, TenantRow.id == SubjectRow.tenant_id
+    )
+    pseudonyms = (context.signer.pseudonym(*row) for row in connection.execute(query))
+    return [RecordProblem(ENROLLMENT_PUT_BACK, each) for each in pseudonyms if each in told.erased]
 
 
 def _counts(told: _Told, context: StoreContext, connection: Connection) -> list[RecordProblem]:

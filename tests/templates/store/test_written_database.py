@@ -12,7 +12,12 @@ import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
 from templates.store import TemplateStore
-from templates.store.evidence import COUNT_LIFTED, KEY_ALTERED, KEY_PUT_BACK
+from templates.store.evidence import (
+    COUNT_LIFTED,
+    ENROLLMENT_PUT_BACK,
+    KEY_ALTERED,
+    KEY_PUT_BACK,
+)
 from tests.templates.store.conftest import Clock, put
 from tests.templates.store.test_attempts import attempt
 
@@ -113,6 +118,31 @@ def test_a_key_of_an_erased_tenant_that_was_put_back_is_reported(store: Template
         "INSERT INTO api_keys SELECT * FROM keys_kept",
     )
     assert reported(store) == [(KEY_PUT_BACK, f"key:{made.key.prefix}")]
+
+
+@pytest.mark.parametrize("whole_tenant", [True, False])
+def test_an_erased_enrollment_that_was_put_back_is_reported(
+    store: TemplateStore, whole_tenant: bool
+) -> None:
+    for name in ("ada", "eve"):
+        put(store, name, b"wire", tenant="other")
+    tables = ("tenants", "subjects", "templates")
+    write(store, *(f"CREATE TABLE {table}_kept AS SELECT * FROM {table}" for table in tables))
+    if whole_tenant:
+        store.erasures.erase_tenant("other")
+        write(store, "INSERT INTO tenants SELECT * FROM tenants_kept WHERE name = 'other'")
+    else:
+        store.erasures.erase("other", "ada")
+        store.erasures.erase("other", "eve")
+    put(store, "eve", b"wire", tenant="other", rotation_epoch=None)
+    write(
+        store,
+        "INSERT INTO subjects SELECT * FROM subjects_kept WHERE subject_id = 'ada'",
+        "INSERT INTO templates SELECT templates_kept.* FROM templates_kept "
+        "JOIN subjects_kept ON subject_pk = id WHERE subject_id = 'ada'",
+    )
+    ada = store.signer.pseudonym("other", "ada")
+    assert reported(store) == [(ENROLLMENT_PUT_BACK, ada)]
 
 
 @pytest.mark.parametrize("enrolled", [True, False])
