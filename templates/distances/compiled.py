@@ -26,7 +26,6 @@ from templates.distances.metric import (
     NEAR,
     STILL,
     Array32,
-    Floats,
     Metric,
     Probes,
     Tile,
@@ -65,6 +64,7 @@ def tiles(
     probes: Probes, templates: SubspaceBatch, *, metric: Metric, steps: int, threads: int | None
 ) -> Iterator[Tile]:
     """Yield rows, columns and distances (R, C) float32 of all parts of the matrix, in order."""
+    probes, terms = _prepared(probes, metric is Metric.SPHERICAL)
     with single_threaded() as available:
         count = threads or available
         most = max(1, _TEMPLATE_ROWS // (templates.m + 1))
@@ -78,7 +78,8 @@ def tiles(
         ]
 
         def compute(rows: slice, columns: slice) -> Tile:
-            return rows, columns, _task(probes[rows], templates[columns], metric, steps)
+            some = probes[rows], terms[rows], templates[columns]
+            return rows, columns, _task(*some, metric, steps)
 
         if count == 1 or len(tasks) == 1:
             yield from (compute(*task) for task in tasks)
@@ -93,57 +94,83 @@ def tiles(
                 yield waiting.popleft().result()
 
 
-def _task(probes: Probes, templates: SubspaceBatch, metric: Metric, steps: int) -> Array32:
+def _task(
+    probes: Probes, terms: Array32, templates: SubspaceBatch, metric: Metric, steps: int
+) -> Array32:
     """Distances of some probes to some templates, whose rows are stacked once."""
     spherical = metric is Metric.SPHERICAL
     m_d = probes.m if isinstance(probes, SubspaceBatch) else 0
-    m_e, n = templates.m, templates.n
-    right = _stacked(templates, spherical).transpose(1, 0, 2).reshape(-1, n)  # all feet first
-    squares = _squares(templates.feet)
+    m_e, n, near = templates.m, templates.n, np.float32(NEAR)
+    right = np.empty((m_e + 1, len(templates), n), dtype=np.float32)
+    _stack(templates, spherical, right.transpose(1, 0, 2))  # all feet first
+    squares = _float32(_squares(templates.feet))
     out = np.empty((len(probes), len(templates)), dtype=np.float32)
-    for rows in parts(len(probes), max(1, _PROBE_ROWS // (m_d + 1))):
-        some = probes[rows]
-        if isinstance(some, SubspaceBatch):
-            left, terms = _stacked(some, spherical).reshape(-1, n), _squares(some.feet)
-        elif spherical:
-            left = exact.normalised(some.astype(np.float64)).astype(np.float32)
-            # A zero probe has no direction: similarity 0 with everything.
-            terms = np.asarray(some.any(axis=1), dtype=np.float32)
-        else:
-            left, terms = some.astype(np.float32, copy=False), _squares(some)
+    step = max(1, _PROBE_ROWS // (m_d + 1))
+    products = np.empty((step * (m_d + 1), right.size // n), dtype=np.float32)
+    stacked = np.empty((step if m_d else 0, m_d + 1, n), dtype=np.float32)
+    for rows in parts(len(probes), step):
+        left, count = probes[rows], rows.stop - rows.start
+        if isinstance(left, SubspaceBatch):
+            _stack(left, spherical, stacked[:count])
+            left = stacked[:count].reshape(-1, n)
+        product = products[: len(left)]
         with np.errstate(over="ignore", invalid="ignore"):  # such pairs are computed again
-            product: Array32 = np.matmul(left, right.T).reshape(len(terms), -1)
-        tile = out[rows]  # of whole rows, so contiguous
+            np.matmul(left, right.reshape(-1, n).T, out=product)
+        product, tile = product.reshape(count, -1), out[rows]  # of whole rows, so contiguous
         if not m_d:
-            _points(product, m_e, terms, squares, spherical, np.float32(NEAR), tile)
+            _points(product, m_e, terms[rows], squares, spherical, near, tile)
         elif spherical:
-            limits = np.float32(NEAR), np.float32(STILL), np.float32(LONGEST)
-            _spherical(product, m_d, m_e, steps, *limits, tile)
+            still, longest = np.float32(STILL), np.float32(LONGEST)
+            _spherical(product, m_d, m_e, steps, near, still, longest, tile)
         else:
-            limits2 = np.float32(NEAR), np.float32(ACCURACY)
-            _euclidean(product, m_d, m_e, terms, squares, *limits2, tile)
+            _euclidean(product, m_d, m_e, terms[rows], squares, near, np.float32(ACCURACY), tile)
     i, j = np.nonzero(out < 0)
     if i.size:
         out[i, j] = exact.pairs(probes, templates, i, j, metric=metric, steps=steps)
     return out
 
 
-def _stacked(batch: SubspaceBatch, spherical: bool) -> Array32:
-    """Rows (N, m + 1, n) [p; D]; of the sphere, p inside the unit ball and D times the radius."""
+def _prepared(probes: Probes, spherical: bool) -> tuple[Probes, Array32]:
+    """Probes in float32, and ‖p‖² of each; or 1/‖e‖ of a point on the sphere, 0 of a zero."""
+    if isinstance(probes, SubspaceBatch):
+        return probes, _float32(_squares(probes.feet))
+    points = np.ascontiguousarray(probes, dtype=np.float32)
+    squares = _squares(points)
     if not spherical:
-        return np.concatenate([batch.feet[:, None], batch.bases], axis=1)
-    scales, radii = (part.astype(np.float32) for part in exact.spheres(batch.feet))
-    rows = np.empty((len(batch), batch.m + 1, batch.n), dtype=np.float32)
-    np.multiply(batch.feet, scales[:, None], out=rows[:, 0])
-    np.multiply(batch.bases, radii[:, None, None], out=rows[:, 1:])
-    return rows
+        return points, _float32(squares)
+    if squares.size and not 1e-12 < squares.min() <= squares.max() < 1e12:  # beyond float32
+        points = exact.normalised(points.astype(np.float64)).astype(np.float32)
+        squares = np.asarray(squares > 0, dtype=np.float64)
+    return points, _float32((squares > 0) / np.sqrt(np.maximum(squares, _TINY)))
 
 
-def _squares(rows: Floats) -> Array32:
-    """Squared lengths, (N,); infinite ones are infinite."""
+def _float32(squares: NDArray[np.float64]) -> Array32:
+    """Round; what is too large is infinite."""
     with np.errstate(over="ignore"):
-        squares: NDArray[np.float64] = np.einsum("ij,ij->i", rows, rows, dtype=np.float64)
         return squares.astype(np.float32)
+
+
+def _stack(batch: SubspaceBatch, spherical: bool, out: Array32) -> None:
+    """Write rows (N, m + 1, n) [p; D]; of the sphere, p in the unit ball and D times the radius."""
+    if spherical:
+        squares = _squares(batch.feet)
+        scales = _float32(1 / np.sqrt(np.maximum(squares, 1)))
+        radii = _float32(np.sqrt(np.maximum(1 - squares, 0)))
+        np.multiply(batch.feet, scales[:, None], out=out[:, 0])
+        np.multiply(batch.bases, radii[:, None, None], out=out[:, 1:])
+    else:
+        out[:, 0], out[:, 1:] = batch.feet, batch.bases
+
+
+@_compiled
+def _squares(rows: Array32) -> NDArray[np.float64]:
+    """Squared lengths, (N,)."""
+    out = np.zeros(len(rows))
+    for i in range(len(rows)):
+        for k in range(rows.shape[1]):
+            x = np.float64(rows[i, k])
+            out[i] += x * x
+    return out
 
 
 @_compiled
