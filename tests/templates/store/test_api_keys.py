@@ -23,6 +23,7 @@ def test_a_token_finds_its_key(store: TemplateStore, clock: Clock) -> None:
     new = store.api_keys.create("default", [Right.ENROLL, "verify"], label="front end")
     start, prefix, secret = new.token.split("_")
     assert (start, prefix, len(secret)) == ("vf", new.key.prefix, 64)
+    assert new.key.is_valid_at(clock.time)
     found = store.api_keys.verify(new.token)
     assert found is not None
     assert (found.tenant, found.label) == ("default", "front end")

@@ -157,6 +157,7 @@ def test_the_latest_lines_of_a_tenant_come_first(filled: TemplateStore) -> None:
     for limit in (1, 4, 9, 1000):
         assert list(chain.from_iterable(pages(limit))) == expected
         assert {len(page) for page in pages(limit)[:-1]} <= {limit}
+        assert [] not in pages(limit)
     (about_one,) = pages(1000, f"{1:064x}")
     assert [line.pseudonym for line in about_one] == [f"{1:064x}"] * 2
     assert log.page("nobody", limit=5) == ([], None)
