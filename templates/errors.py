@@ -27,7 +27,7 @@
     ├── InconsistentImages [3]   photos that do not show one and the same person
     ├── DatasetError [4]         a dataset that cannot be read
     ├── EvaluationError [5]      an evaluation that cannot be made as it was asked for
-    ├── BackendError [6]         a place to work, such as a cluster, that cannot be used
+    ├── ClusterError [6]         a Dask cluster that cannot be used
     ├── AuditError [7]           an attack or an audit that cannot be made as it was asked for
     ├── StartError [8]           the service or a command cannot start
     │   └── DatabaseAway         the database does not answer now
@@ -37,7 +37,7 @@
 
 Each is defined here, or next to what raises it: [1] ``templates.store.identifiers``,
 [3] ``templates.space.agreement``, [4] ``verify.datasets``,
-[5] ``verify.evaluation.plan``, [6] ``verify.evaluation.backends``, [7] ``attacks.errors``,
+[5] ``verify.evaluation.plan``, [6] ``verify.evaluation.cluster``, [7] ``attacks.errors``,
 [8] ``api.http.errors``, [9] ``api.process.preparation``, [10] ``api.cli.errors``,
 [11] ``templates.store.tenants``, [12] ``templates.store.lockout``,
 [13] ``templates.store.audit_log``, [17] ``templates.store.subjects``.

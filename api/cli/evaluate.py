@@ -1,5 +1,6 @@
 """``veilface evaluate``: the paper's face-verification experiment, on any usual benchmark."""
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Annotated
 
@@ -21,7 +22,7 @@ from api.cli.options import PROCESSOR, AsJson, Device, chosen_device, quick, tak
 from api.settings import Settings
 from templates.distances import Metric
 from templates.keys.private_file import make_folder
-from verify.evaluation.backends import Backend, BackendError
+from verify.evaluation.cluster import cluster as dask_cluster
 from verify.evaluation.embedder import PackEmbedder
 from verify.evaluation.experiment import run_evaluation
 from verify.evaluation.labels_file import read_labels
@@ -109,9 +110,7 @@ def evaluate(
             "and hybrid+ its attributes."
         ),
     ] = None,
-    out: Annotated[Path, typer.Option(help="Folder of the results; a run goes on there.")] = Path(
-        "evaluation"
-    ),
+    out: Annotated[Path, typer.Option(help="Folder of the results.")] = Path("evaluation"),
     aligned: Annotated[
         bool | None,
         typer.Option(
@@ -122,16 +121,17 @@ def evaluate(
     ] = None,
     flip: Flip = False,
     cache: Cache = None,
-    backend: Annotated[
-        str,
+    cluster: Annotated[
+        str | None,
         typer.Option(
-            help="`local`, or `dask://HOST:PORT` of a Dask scheduler (`dask+tls://` with TLS), "
-            "whose workers have veilface."
+            metavar="ADDRESS",
+            help="Compare on a Dask cluster, whose scheduler is at this address, such as "
+            "`tcp://HOST:PORT`, and whose workers have veilface. Unset: here.",
         ),
-    ] = "local",
+    ] = None,
     jobs: Annotated[
         int | None,
-        typer.Option(min=1, help="Local processes. Unset: one a processor, 8 at most."),
+        typer.Option(min=1, help="Threads here. Unset: one a processor, 8 at most."),
     ] = None,
     device: Device = PROCESSOR,
     audit: Annotated[
@@ -146,17 +146,13 @@ def evaluate(
     """Evaluate face verification with private templates: the LFW / CFP / AgeDB protocol.
 
     Writes results.json, results.csv, results.md, figures (PNG and SVG) and results.html, which has
-    all to read in one file, to --out. An interrupted run goes on where it stopped.
+    all to read in one file, to --out. With --cache a second run does not embed the photos again.
     docs/evaluation.md explains every figure.
 
     Example: `veilface evaluate lfw.bin --pack buffalo_l --decoys decoys.veil --out lfw-results`
     """
     require_extra("evaluate")
-    try:
-        where = Backend.parse(backend, jobs=jobs or default_jobs())
-    except BackendError as error:
-        raise UsageError(str(error)) from None
-    torch_device = chosen_device(device, here=where.scheduler is None)
+    torch_device = chosen_device(device, here=cluster is None)
     sets = open_all(datasets, pictures=embeddings is None)
     report = None if audit is None else read_audit(audit)
     names = None
@@ -182,29 +178,28 @@ def evaluate(
     except EvaluationError as error:
         raise UsageError(str(error)) from None
     known = None if labels is None else read_labels(labels)
-    if cache is not None and where.scheduler is not None:
-        message("note: --cache is not used with a cluster; its workers keep no embeddings")
     kept = open_cache(cache, settings)
     make_folder(out)
-    results = run_evaluation(
-        plan,
-        embedder,
-        sets,
-        sources,
-        known,
-        out=out,
-        cache=kept,
-        backend=where,
-        options={
-            "flip": flip,
-            "axes": axes,
-            "backend": "local" if where.scheduler is None else "dask",
-            "labels": named_file(labels),
-            "audit": named_file(audit),
-        },
-        note=lambda sentence: message(f"note: {sentence}"),
-        progress=progress,
-    )
+    local = ThreadPoolExecutor(jobs or default_jobs())
+    with local if cluster is None else dask_cluster(cluster) as executor:
+        results = run_evaluation(
+            plan,
+            embedder,
+            sets,
+            sources,
+            known,
+            cache=kept,
+            executor=executor,
+            options={
+                "flip": flip,
+                "axes": axes,
+                "cluster": cluster is not None,
+                "labels": named_file(labels),
+                "audit": named_file(audit),
+            },
+            note=lambda sentence: message(f"note: {sentence}"),
+            progress=progress,
+        )
     written = write_results(results, out, audit=report)
     notice = {}
     if isinstance(embedder, PackEmbedder):

@@ -92,8 +92,6 @@ def open_embedder(
         pack = bulk_pack(settings, flip=flip, why=why)
         return PackEmbedder(
             pack,
-            Path(str(settings.pack)).expanduser().resolve(),
-            settings.providers,
             recorded_of(pack),
             mirrored=raw_flip,
             aligned=aligned,
@@ -146,5 +144,5 @@ def open_sources(
 
 
 def default_jobs() -> int:
-    """Processes: as many as processors, 8 at most, since each needs about 0.4 GB."""
+    """Threads: as many as processors, 8 at most, since each needs about 0.2 GB."""
     return min(8, default_workers())

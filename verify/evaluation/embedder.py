@@ -3,20 +3,18 @@
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from pathlib import Path
 
 from models.cache import EmbeddingCache
+from models.extraction import Extractor
 from models.pack import ModelPack
 from verify.evaluation.acquisition import (
     EmbeddedSet,
-    PackSource,
     acquire,
     are_aligned,
     digest_of_pictures,
     digests,
     from_file,
 )
-from verify.evaluation.backends import Backend
 from verify.evaluation.embeddings_file import EmbeddingsFile
 from verify.evaluation.plan import EvaluationError
 from verify.evaluation.results import Model
@@ -45,11 +43,10 @@ class FileEmbedder:
         pairs: VerificationSet,
         *,
         cache: EmbeddingCache | None,
-        backend: Backend,
         progress: Progress,
     ) -> EmbeddedSet:
         """Take the embeddings of a set from the file; absent ones failed to acquire."""
-        del cache, backend, progress
+        del cache, progress
         return EmbeddedSet(pairs, from_file(pairs, self.file), None, "")
 
 
@@ -66,8 +63,6 @@ class PackEmbedder:
     """
 
     pack: ModelPack
-    folder: Path
-    providers: tuple[str, ...]
     facts: Json
     mirrored: bool
     aligned: bool | None
@@ -83,7 +78,6 @@ class PackEmbedder:
         pairs: VerificationSet,
         *,
         cache: EmbeddingCache | None,
-        backend: Backend,
         progress: Progress,
     ) -> EmbeddedSet:
         """Embed the photos of a set; those that fail are counted.
@@ -95,25 +89,9 @@ class PackEmbedder:
         """
         contents = digests(pairs)
         aligned = self._aligned(pairs)
-        source = PackSource(
-            folder=self.folder,
-            embedder_sha256=self.pack.info.embedder_sha256,
-            providers=self.providers,
-            threads=None if backend.scheduler is None else 1,
-            flip=bool(self.pack.info.preprocessing["flip"]),
-            aligned=aligned,
-            mirrored=self.mirrored,
-        )
+        extractor = Extractor(self.pack, aligned=aligned, cache=cache, mirrored=self.mirrored)
         with progress(f"embedding {pairs.name}", len(pairs.pictures)) as advance:
-            acquired = acquire(
-                pairs,
-                contents,
-                self.pack,
-                source,
-                cache=cache,
-                backend=backend,
-                progress=advance,
-            )
+            acquired = acquire(pairs, contents, extractor, progress=advance)
         return EmbeddedSet(pairs, acquired, aligned, digest_of_pictures(contents))
 
     def _aligned(self, pairs: VerificationSet) -> bool:

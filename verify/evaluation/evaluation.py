@@ -1,11 +1,10 @@
 """The evaluation of one set: all units, wherever they run, put together in a fixed order."""
 
-import hashlib
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
-from importlib.metadata import version
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,13 +12,11 @@ from numpy.typing import NDArray
 
 from templates.decoys import Attributes
 from verify.evaluation.acquisition import Acquired
-from verify.evaluation.backends import SOFTWARE, Backend, spread
-from verify.evaluation.checkpoints import Checkpoints
 from verify.evaluation.material import Material, Source
 from verify.evaluation.plan import EvaluationPlan, units_of
 from verify.evaluation.rows import SetFacts
 from verify.evaluation.runs import Run, run_unit
-from verify.evaluation.scoring import SCORING_VERSION, unit_layout
+from verify.evaluation.scoring import unit_layout
 from verify.evaluation.units import LiftUnit, Unit
 from verify.evaluation.verification_set import VerificationSet, require_both_classes
 
@@ -58,7 +55,6 @@ class Work:
 
     unit: Unit
     seconds: float
-    resumed: bool
 
 
 def prepare(
@@ -118,71 +114,35 @@ def evaluate_set(
     kept: NDArray[np.int64],
     *,
     plan: EvaluationPlan,
-    out: Path,
-    backend: Backend,
+    executor: Executor,
     progress: Advance,
 ) -> Evaluated:
-    """Run all units of a plan on one set; those found in ``out`` are not computed again.
+    """Compute all units of a plan on one set.
 
     Parameters
     ----------
+    executor
+        Where units are computed: threads, processes or a cluster.
     progress
         Called with the number of units done since the last call.
     """
     units = units_of(plan, material.sources, n=material.n)
-    checkpoints = Checkpoints(
-        out,
-        {
-            "software": version(SOFTWARE),
-            "numpy": version("numpy"),
-            "scoring": SCORING_VERSION,
-            "material": _digest(material),
-        },
-        sources=[source.source_id for source in material.sources],
-        attributes=material.attributes or (),
-        flipped=material.flipped,
-    )
-    layouts = [unit_layout(unit, material.sources) for unit in units]
-    known = [
-        checkpoints.load(unit, columns=len(layout), pairs=len(material))
-        for unit, layout in zip(units, layouts, strict=True)
-    ]
-    shared = (material, plan.targets)
-    runs_of_unit: list[list[Run]] = [[] for _ in units]
-    seconds = [0.0 for _ in units]
-    for index, (runs, taken) in spread(backend, _run, shared, zip(units, known, strict=True)):
-        if known[index] is None:
-            checkpoints.save(units[index], runs)
-        runs_of_unit[index], seconds[index] = runs, taken
+    runs: list[Run] = []
+    work: list[Work] = []
+    results = executor.map(partial(_run, material, plan.targets), units)
+    for unit, (unit_runs, seconds) in zip(units, results, strict=True):
+        runs += unit_runs
+        work.append(Work(unit, seconds))
         progress(1)
     source_of = {
         cell: unit.source if isinstance(unit, LiftUnit) else None
-        for unit, layout in zip(units, layouts, strict=True)
-        for cell, _ in layout
+        for unit in units
+        for cell, _ in unit_layout(unit, material.sources)
     }
-    work = [
-        Work(unit, taken, resumed=column is not None)
-        for unit, taken, column in zip(units, seconds, known, strict=True)
-    ]
-    runs = [run for unit_runs in runs_of_unit for run in unit_runs]
     return Evaluated(facts, material, kept, runs, source_of, work)
 
 
-def _run(
-    shared: tuple[Material, Sequence[float]], item: tuple[Unit, list[NDArray[np.float64]] | None]
-) -> tuple[list[Run], float]:
-    material, targets = shared
-    unit, known = item
+def _run(material: Material, targets: Sequence[float], unit: Unit) -> tuple[list[Run], float]:
     start = time.perf_counter()
-    runs = run_unit(material, unit, targets=targets, known=known)
+    runs = run_unit(material, unit, targets=targets)
     return runs, time.perf_counter() - start
-
-
-def _digest(material: Material) -> str:
-    """Name what is compared, descriptors included: whatever changes them, changes it."""
-    whole = hashlib.sha256()
-    pairs = (material.first, material.second, material.same, material.folds)
-    for part in (material.descriptors, *pairs):
-        data = np.ascontiguousarray(part).tobytes()
-        whole.update(len(data).to_bytes(8, "big") + data)
-    return whole.hexdigest()

@@ -1,8 +1,8 @@
 """The evaluation of a plan on any number of sets: embed, leave test people out, score, report."""
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -11,7 +11,6 @@ from templates.decoys import DecoyPool
 from templates.space.lifting import Strategy
 from verify.evaluation.acquisition import EmbeddedSet
 from verify.evaluation.attributes import known_attributes, resembling
-from verify.evaluation.backends import Backend
 from verify.evaluation.embedder import Embedder, Progress
 from verify.evaluation.evaluation import Evaluated, evaluate_set, prepare
 from verify.evaluation.groups import by_group
@@ -36,9 +35,8 @@ def run_evaluation(
     sources: Sequence[SourceFacts],
     labels: Labels | None,
     *,
-    out: Path,
     cache: EmbeddingCache | None,
-    backend: Backend,
+    executor: Executor,
     options: Json,
     note: Note,
     progress: Progress,
@@ -51,8 +49,7 @@ def run_evaluation(
         No photo of a set gave an embedding, or every decoy resembles one of its people.
     """
     embedded = [
-        _embedded(embedder, pairs, cache=cache, backend=backend, note=note, progress=progress)
-        for pairs in sets
+        _embedded(embedder, pairs, cache=cache, note=note, progress=progress) for pairs in sets
     ]
     results: list[SetResult] = []
     groups: list[Json] = []
@@ -73,7 +70,7 @@ def run_evaluation(
         units = units_of(plan, decoys, n=material.n)
         with progress(f"evaluating {name}", len(units)) as advance:
             evaluated = evaluate_set(
-                material, facts, kept, plan=plan, out=out, backend=backend, progress=advance
+                material, facts, kept, plan=plan, executor=executor, progress=advance
             )
         results.append(SetResult(faces, evaluated, kept_sources))
         if any(isinstance(source, DecoyPool) for source in decoys):
@@ -101,11 +98,10 @@ def _embedded(
     pairs: VerificationSet,
     *,
     cache: EmbeddingCache | None,
-    backend: Backend,
     note: Note,
     progress: Progress,
 ) -> EmbeddedSet:
-    faces = embedder.embed(pairs, cache=cache, backend=backend, progress=progress)
+    faces = embedder.embed(pairs, cache=cache, progress=progress)
     failures = faces.acquired.failures
     if not len(faces.acquired.descriptors):
         raise EvaluationError(

@@ -14,7 +14,7 @@ from templates.decoys import DecoyPool
 from templates.keys.rotation import ROTATION_VERSION
 from templates.space.lifting import Strategy
 from verify.evaluation.acquisition import EmbeddedSet
-from verify.evaluation.backends import SOFTWARE
+from verify.evaluation.cluster import SOFTWARE
 from verify.evaluation.evaluation import Evaluated, Work
 from verify.evaluation.material import Source
 from verify.evaluation.plan import EvaluationPlan
@@ -214,7 +214,6 @@ def _work(evaluated: Evaluated) -> list[Json]:
             "decoys": decoys,
             "dim": dim,
             "units": len(works),
-            "resumed": sum(work.resumed for work in works),
             "seconds_mean": float(np.mean([work.seconds for work in works])),
         }
         for (strategy, decoys, dim), works in kinds.items()

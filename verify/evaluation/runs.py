@@ -15,7 +15,7 @@ from verify.evaluation.resampling import (
     fmr_grid,
     replicate_weights,
 )
-from verify.evaluation.scoring import Scores, score_unit, unit_layout
+from verify.evaluation.scoring import Scores, score_unit
 from verify.evaluation.units import Cell, Lifted, RawUnit, Search, Unit
 
 Array64 = NDArray[np.float64]
@@ -49,14 +49,8 @@ def run_unit(
     unit: Unit,
     *,
     targets: Sequence[float],
-    known: Sequence[Array64] | None = None,
 ) -> list[Run]:
     """Compute the runs of a unit.
-
-    Parameters
-    ----------
-    known
-        Similarities of an earlier run of this unit, in the order of ``unit_layout``.
 
     Notes
     -----
@@ -64,20 +58,12 @@ def run_unit(
     differently.
     """
     with single_threaded():
-        if known is None:
-            scores = score_unit(material, unit)
-        else:
-            layout = unit_layout(unit, material.sources)
-            scores = [
-                Scores(cell, lifted, column)
-                for (cell, lifted), column in zip(layout, known, strict=True)
-            ]
         searches: tuple[Search, ...] = (
             ("grid", "exact") if isinstance(unit, RawUnit) else ("exact",)
         )
         runs = [
             _run(material, unit, unit_scores, search, targets)
-            for unit_scores in scores
+            for unit_scores in score_unit(material, unit)
             for search in searches
         ]
         _add_replicates(material, runs)

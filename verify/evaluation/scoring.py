@@ -27,8 +27,6 @@ from verify.evaluation.units import (
     Unit,
 )
 
-SCORING_VERSION = 1
-"""Raised with every change that gives a unit other similarities: old ones are then not found."""
 _TILE = 8192
 """Subspace rows (pairs times m) that are lifted at once on either side."""
 

@@ -91,7 +91,7 @@ def test_every_extra_brings_what_its_commands_need():
     ("words", "package", "extra"),
     [
         (("evaluate", "lfw.bin"), "matplotlib", "evaluate"),
-        (("evaluate", "lfw.bin"), "joblib", "evaluate"),
+        (("evaluate", "lfw.bin"), "numba", "evaluate"),
         (("audit", "templates", "people"), "sklearn", "audit"),
         (("audit", "fairface", "faces"), "matplotlib", "audit"),
         (("db", "upgrade", "--database-url", "postgresql:///faces"), "psycopg", "postgres"),

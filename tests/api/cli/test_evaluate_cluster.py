@@ -1,6 +1,6 @@
 """`veilface evaluate` on a Dask cluster of two workers."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -8,10 +8,9 @@ import psutil
 import pytest
 from distributed import LocalCluster
 
-from models.pack import ModelPack
 from tests.api.cli.conftest import run
 from tests.api.cli.evaluation_bench import secrets
-from verify.evaluation import embedder, evaluation
+from verify.evaluation import evaluation
 
 
 @pytest.fixture(scope="module")
@@ -26,10 +25,6 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LocalCluster]:
         yield running
 
 
-def address(cluster: LocalCluster) -> str:
-    return str(cluster.scheduler_address).replace("tcp", "dask")
-
-
 def refused(*given: Any, **named: Any) -> Any:
     raise AssertionError("this work belongs to the cluster")
 
@@ -37,17 +32,15 @@ def refused(*given: Any, **named: Any) -> Any:
 @pytest.mark.long
 def test_a_cluster_gives_the_same_bits(bench, results, cluster, tmp_path, monkeypatch):
     before = {process.pid for process in psutil.Process().children(recursive=True)}
-    # Workers are processes of their own: this one must neither embed nor compare.
-    for name in ("embed", "embed_both"):
-        monkeypatch.setattr(ModelPack, name, refused)
+    # Workers are processes of their own: this one compares nothing.
     monkeypatch.setattr(evaluation, "run_unit", refused)
     out = tmp_path / "out"
-    ran = run(*bench.full, "--backend", address(cluster), "--out", out, "--json")
+    ran = run(*bench.full, "--cluster", cluster.scheduler_address, "--out", out, "--json")
     assert ran.status == 0, ran.stderr
     monkeypatch.undo()
     for part in ("rows", "runs", "curves", "groups", "datasets", "decoys", "model"):
         assert ran.json[part] == results[part]
-    assert ran.json["options"] == results["options"] | {"backend": "dask"}
+    assert ran.json["options"] == results["options"] | {"cluster": True}
     after = {process.pid for process in psutil.Process().children(recursive=True)}
     assert after <= before
     # Workers may write what they hold to files when memory is short.
@@ -56,25 +49,9 @@ def test_a_cluster_gives_the_same_bits(bench, results, cluster, tmp_path, monkey
     assert not [needle for needle in secrets(bench) if needle in b"\n".join(held)]
 
 
-# Without the command, `tests/verify/evaluation/test_acquisition.py` has it in `make test`.
-@pytest.mark.long
-def test_a_worker_without_the_pack_is_said_in_one_sentence(bench, cluster, tmp_path, monkeypatch):
-    plain: Callable[..., Any] = embedder.PackSource
-    absent = tmp_path / "elsewhere"
-    monkeypatch.setattr(
-        embedder, "PackSource", lambda **named: plain(**(named | {"folder": absent}))
-    )
-    ran = run(*bench.full, "--backend", address(cluster), "--out", tmp_path / "out")
-    assert (ran.status, ran.stdout) == (1, "")
-    assert ran.stderr.splitlines()[-1] == (
-        f"error: a worker does not find the pack {absent}: it must lie at the same path there"
-    )
-    assert "Traceback" not in ran.stderr
-
-
 def test_a_cluster_that_is_not_there_is_said_in_one_sentence(bench, tmp_path, monkeypatch):
-    monkeypatch.setattr("verify.evaluation.backends.CONNECT_SECONDS", 0.5)
-    ran = run(*bench.full, "--backend", "dask://127.0.0.1:1", "--out", tmp_path / "out")
+    monkeypatch.setattr("verify.evaluation.cluster.CONNECT_SECONDS", 0.5)
+    ran = run(*bench.full, "--cluster", "tcp://127.0.0.1:1", "--out", tmp_path / "out")
     assert (ran.status, ran.stdout) == (1, "")
     assert "error: no Dask scheduler answers at tcp://127.0.0.1:1" in ran.stderr
     assert "Traceback" not in ran.stderr

@@ -1,5 +1,5 @@
 import json
-from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,9 +11,7 @@ from models.extraction import Failure
 from templates.distances import Metric
 from tests.verify.evaluation.materials import N, material, pool
 from verify.datasets import DatasetError
-from verify.evaluation import evaluation
 from verify.evaluation.acquisition import Acquired, EmbeddedSet
-from verify.evaluation.backends import Backend
 from verify.evaluation.evaluation import Evaluated, evaluate_set, prepare
 from verify.evaluation.measures import measure
 from verify.evaluation.plan import EvaluationPlan
@@ -41,24 +39,17 @@ def verification_set(pairs: int = 100, people: int = 30) -> VerificationSet:
     )
 
 
-def run(
-    out: Path,
-    plan: EvaluationPlan = PLAN,
-    *,
-    jobs: int = 1,
-    advance: Callable[[int], None] = lambda _: None,
-) -> Evaluated:
-    known = material()
+def run(plan: EvaluationPlan = PLAN) -> Evaluated:
     facts = SetFacts("made", 50, 50, 0, 0, 0.0, names_people=True)
-    return evaluate_set(
-        known,
-        facts,
-        np.arange(100),
-        plan=plan,
-        out=out,
-        backend=Backend(None, jobs),
-        progress=advance,
-    )
+    with ThreadPoolExecutor(2) as executor:
+        return evaluate_set(
+            material(),
+            facts,
+            np.arange(100),
+            plan=plan,
+            executor=executor,
+            progress=lambda _: None,
+        )
 
 
 def document_of(evaluated: Evaluated, plan: EvaluationPlan = PLAN) -> dict[str, Any]:
@@ -70,8 +61,8 @@ def document_of(evaluated: Evaluated, plan: EvaluationPlan = PLAN) -> dict[str, 
     )
 
 
-def test_rows_are_means_of_their_runs(tmp_path: Path) -> None:
-    results = document_of(run(tmp_path))
+def test_rows_are_means_of_their_runs() -> None:
+    results = document_of(run())
     rows, runs = results["rows"], results["runs"]
     # raw by two searches; 2 strategies x 2 dims x 2 modes x 2 metrics; two scenarios of codes.
     assert len(rows) == 2 + 2 * 2 * 2 * 2 + 2
@@ -104,64 +95,7 @@ def test_rows_are_means_of_their_runs(tmp_path: Path) -> None:
     assert len(results["curves"]) == len(rows) - 1
 
 
-@pytest.mark.long
-def test_results_do_not_depend_on_where_the_work_is_done(tmp_path: Path) -> None:
-    here = document_of(run(tmp_path / "one"))
-    there = document_of(run(tmp_path / "two", jobs=2))
-    for part in ("rows", "runs", "curves"):
-        assert here[part] == there[part]
-
-
-def test_a_run_goes_on_where_it_was_interrupted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    whole = document_of(run(tmp_path / "whole"))
-    done = 0
-
-    def interrupt(_: int) -> None:
-        nonlocal done
-        done += 1
-        if done == 5:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        run(tmp_path / "cut", advance=interrupt)
-    computed = []
-    plain = evaluation.run_unit
-
-    def counted(*given: Any, **named: Any) -> Any:
-        if named["known"] is None:
-            computed.append(given)
-        return plain(*given, **named)
-
-    monkeypatch.setattr(evaluation, "run_unit", counted)
-    again = document_of(run(tmp_path / "cut"))
-    assert len(computed) == 1 + 2 * 2 * 2 + 2 * 2 - 5
-    for part in ("rows", "runs", "curves"):
-        assert again[part] == whole[part]
-    assert sum(entry["resumed"] for entry in again["work"]) == 5
-    # A file that was cut off is computed again.
-    damaged = sorted((tmp_path / "cut" / "units").iterdir())[0]
-    damaged.write_bytes(damaged.read_bytes()[:100])
-    computed.clear()
-    assert document_of(run(tmp_path / "cut"))["rows"] == whole["rows"]
-    assert len(computed) == 1
-
-
-def test_no_descriptor_is_kept_on_the_way(tmp_path: Path) -> None:
-    run(tmp_path)
-    known = material()
-    files = [path for path in tmp_path.rglob("*") if path.is_file()]
-    assert files
-    for path in files:
-        data = path.read_bytes()
-        assert not any(row[:4].tobytes() in data for row in known.descriptors)
-        assert not any(row[:4].astype(float).tobytes() in data for row in known.descriptors)
-        with np.load(path) as saved:
-            assert all(column.shape == (100,) for column in saved.values())
-
-
-def test_pairs_without_a_descriptor_are_counted(tmp_path: Path) -> None:
+def test_pairs_without_a_descriptor_are_counted() -> None:
     pairs = verification_set()
     rows = np.arange(60)
     lost = pairs.pictures[int(pairs.first[0])].name
@@ -191,8 +125,8 @@ def test_pairs_without_a_descriptor_are_counted(tmp_path: Path) -> None:
         prepare(pairs, everything, attributes=None, sources=())
 
 
-def test_rates_with_failures_follow_the_standard(tmp_path: Path) -> None:
-    evaluated = run(tmp_path, EvaluationPlan(("raw",), targets=(0.1,)))
+def test_rates_with_failures_follow_the_standard() -> None:
+    evaluated = run(EvaluationPlan(("raw",), targets=(0.1,)))
     facts = SetFacts("made", 50, 50, 3, 2, 0.04, names_people=False)
     (first, *_) = evaluated.runs
     row = row_json(first.cell, "grid", [first], facts, seed=0, n=N, source=None, contract_id=None)
@@ -228,27 +162,8 @@ def test_folds_of_the_made_up_set_are_those_of_the_literature() -> None:
     np.testing.assert_array_equal(np.bincount(contiguous_folds(103)), [11, 11, 11] + [10] * 7)
 
 
-def test_what_was_computed_on_other_descriptors_is_not_found(tmp_path: Path) -> None:
-    plan = EvaluationPlan(("raw", "random"), dims=(2,), repeats=1)
-    run(tmp_path, plan)
-    again = run(tmp_path, plan)
-    assert all(work.resumed for work in again.work)
-    facts = SetFacts("other", 50, 50, 0, 0, 0.0, names_people=True)
-    # Same pairs of rows, other faces: as another model, or other photos, would give.
-    other = evaluate_set(
-        material(seed=1),
-        facts,
-        np.arange(100),
-        plan=plan,
-        out=tmp_path,
-        backend=Backend(None, 1),
-        progress=lambda _: None,
-    )
-    assert not any(work.resumed for work in other.work)
-
-
-def test_classes_without_spread_give_a_document(tmp_path: Path) -> None:
-    evaluated = run(tmp_path, EvaluationPlan(("raw",)))
+def test_classes_without_spread_give_a_document() -> None:
+    evaluated = run(EvaluationPlan(("raw",)))
     first = evaluated.runs[0]
     flat = np.where(evaluated.material.same, 1.0, 0.0)
     folds = evaluated.material.folds
