@@ -1,1 +1,1 @@
-"""The paper's face-verification experiment: benchmark sets, protocol, baselines, figures."""
+"""The paper's face-verification experiment: benchmark sets, protocol, figures."""

@@ -8,16 +8,14 @@ from templates.decoys import DecoyPool
 from templates.distances import DEFAULT_STEPS, Metric
 from templates.errors import VeilfaceError
 from templates.space.lifting import Strategy
-from verify.evaluation.baselines import Hash
 from verify.evaluation.material import Source
-from verify.evaluation.units import RAW, RAW_FLIP, HashUnit, LiftUnit, Mode, RawUnit, Unit
+from verify.evaluation.units import RAW, RAW_FLIP, LiftUnit, Mode, RawUnit, Unit
 
-STRATEGIES = (RAW, RAW_FLIP, *(strategy.value for strategy in Strategy), *(h.value for h in Hash))
+STRATEGIES = (RAW, RAW_FLIP, *(strategy.value for strategy in Strategy))
 WITHOUT_DECOYS = (
     RAW,
     RAW_FLIP,
     *(strategy.value for strategy in Strategy if not strategy.needs_decoys),
-    *(scheme.value for scheme in Hash),
 )
 DIMS = (2, 4, 8, 16)
 TARGETS = (1e-2, 1e-3, 1e-4)
@@ -106,10 +104,6 @@ def units_of(plan: EvaluationPlan, sources: Sequence[Source], *, n: int) -> list
     for name in plan.strategies:
         if name in (RAW, RAW_FLIP):
             units.append(RawUnit(flip=name == RAW_FLIP))
-        elif name in set(Hash):
-            units += [
-                HashUnit(Hash(name), n, stolen, seed) for stolen in (False, True) for seed in seeds
-            ]
         else:
             strategy = Strategy(name)
             _check_dims(strategy, plan.dims, n)

@@ -223,7 +223,7 @@ def _work(evaluated: Evaluated) -> list[Json]:
 def contract_id(model: Model, cell: Cell, source: Source | None) -> str | None:
     """Contract that templates of a cell belong to; None where none can be made.
 
-    A contract binds an embedder and a decoy source, so raw descriptors, codes, random lifting and
+    A contract binds an embedder and a decoy source, so raw descriptors, random lifting and
     descriptors from a file have none.
     """
     if source is None or model.embedder_sha256 is None or model.preprocessing is None:
@@ -241,13 +241,11 @@ def contract_id(model: Model, cell: Cell, source: Source | None) -> str | None:
 
 
 def _order(plan: EvaluationPlan, cell: Cell, search: str) -> tuple[Any, ...]:
-    """Rows as the plan names them; raw first, stolen tokens after the others."""
+    """Rows as the plan names them, raw first."""
     modes = list(Mode)
-    plain = cell.strategy.removesuffix("-stolen")
     return (
         modes.index(cell.mode),
-        plan.strategies.index(plain),
-        cell.strategy != plain,
+        plan.strategies.index(cell.strategy),
         cell.decoys or "",
         cell.dim,
         cell.metric,

@@ -9,10 +9,9 @@ Row = Mapping[str, Any]
 
 RAW = ("raw", "raw+flip")
 LIFTINGS = tuple(strategy.value for strategy in Strategy)
-HASHES = ("biohashing", "biohashing-stolen", "mlp-hash", "mlp-hash-stolen")
-ORDER = RAW + LIFTINGS + HASHES
-METRIC_NAMES = {"spherical": "spherical", "euclidean": "Euclidean", "hamming": "Hamming"}
-MODE_NAMES = {"p2p": "raw", "p2s": "p-to-s", "s2s": "s-to-s", "hash": "hash"}
+ORDER = RAW + LIFTINGS
+METRIC_NAMES = {"spherical": "spherical", "euclidean": "Euclidean"}
+MODE_NAMES = {"p2p": "raw", "p2s": "p-to-s", "s2s": "s-to-s"}
 LIFTED_MODES = ("p2s", "s2s")
 PREFERRED_METRICS = ("spherical", "euclidean")
 
@@ -26,8 +25,7 @@ def decoys_label(row: Row) -> str:
 def strategy_label(row: Row) -> str:
     """Return the strategy with its decoys, such as ``adversarial (pool, shared)``."""
     decoys = decoys_label(row)
-    strategy = str(row["strategy"]).replace("-stolen", ", stolen token")
-    return f"{strategy} ({decoys})" if decoys else strategy
+    return f"{row['strategy']} ({decoys})" if decoys else str(row["strategy"])
 
 
 def order_of(row: Row) -> tuple[Any, ...]:

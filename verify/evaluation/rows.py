@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from templates.contract import wire
 from templates.decoys import DecoyPool
 from templates.space.lifting import Strategy
-from verify.evaluation.baselines import packed_bytes
 from verify.evaluation.material import Source
 from verify.evaluation.resampling import Interval, fmr_grid
 from verify.evaluation.runs import Run
@@ -211,8 +210,6 @@ def template_bytes(cell: Cell, n: int) -> int:
     """Bytes that a stored template has: on the wire, in float16; raw descriptors as float32."""
     if cell.mode is Mode.RAW:
         return 4 * n
-    if cell.mode is Mode.HASH:
-        return packed_bytes(cell.dim)
     return wire.encoded_size(n, cell.dim, "float16")
 
 

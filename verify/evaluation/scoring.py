@@ -11,15 +11,12 @@ from templates.distances import Metric, on_device, paired_distances, similarity
 from templates.keys.randomness import Keystream
 from templates.space.lifting import Strategy, lift
 from templates.space.subspace import SubspaceBatch
-from verify.evaluation.baselines import hash_similarities
 from verify.evaluation.material import Material, Source
 from verify.evaluation.units import (
     RAW,
     RAW_FLIP,
-    STOLEN,
     Cell,
     DecoyKind,
-    HashUnit,
     Lifted,
     LiftUnit,
     Mode,
@@ -38,9 +35,9 @@ class Scores:
     Parameters
     ----------
     lifted
-        Which photo of each pair was lifted; None for raw descriptors and codes.
+        Which photo of each pair was lifted; None for raw descriptors.
     similarities : (P,) float64
-        1 − d²/2, or 1 − d/bits for codes.
+        1 − d²/2.
     """
 
     cell: Cell
@@ -54,9 +51,6 @@ def unit_layout(unit: Unit, sources: tuple[Source, ...]) -> list[tuple[Cell, Lif
         case RawUnit():
             name = RAW_FLIP if unit.flip else RAW
             return [(Cell(name, None, None, 0, Mode.RAW, Metric.EUCLIDEAN.value), None)]
-        case HashUnit():
-            name = f"{unit.scheme}{STOLEN if unit.stolen else ''}"
-            return [(Cell(name, None, None, unit.bits, Mode.HASH, "hamming"), None)]
     kind = None if unit.source is None else decoy_kind(sources[unit.source])
     sides: list[tuple[Mode, Lifted]] = []
     if Mode.POINT in unit.modes:
@@ -88,19 +82,6 @@ def score_unit(material: Material, unit: Unit) -> list[Scores]:
             if rows is None:
                 raise ValueError("embeddings with the mirror image were not acquired")
             columns = [_cosines(rows, material.first, material.second)]
-        case HashUnit():
-            columns = [
-                hash_similarities(
-                    material.descriptors,
-                    material.first,
-                    material.second,
-                    material.same,
-                    scheme=unit.scheme,
-                    bits=unit.bits,
-                    stolen=unit.stolen,
-                    seed=unit.seed,
-                )
-            ]
         case LiftUnit():
             columns = _lifted(material, unit, layout)
     return [

@@ -22,7 +22,6 @@ from verify.evaluation.markdown_cells import (
     table,
 )
 from verify.evaluation.row_labels import (
-    HASHES,
     METRIC_NAMES,
     RAW,
     Row,
@@ -128,7 +127,6 @@ HOW_TO_READ = """## How to read this
 - FNMR at FMR: the threshold lets at most that share of impostor pairs through on all folds together; in brackets the 95 % interval (bootstrap by subject where the people are known, else bootstrap of pairs, both never narrower than Wilson's), in parentheses errors (mean over runs) of trials.
 - p-to-s compares a raw probe with a lifted template, s-to-s two lifted ones; p-to-s rows average the metrics of lifting either side. m is the dimension of the subspace; the spherical distance uses that descriptors have norm 1.
 - Collision floor: the share of impostor pairs expected to share decoys and so to be at distance 0; no threshold brings the FMR below it. Collisions are impostor pairs seen closer than 1e-3.
-- Rows of mlp-hash are of a reconstruction from the published description (docs/evaluation.md).
 - Failures to acquire are in none of these rates; FAR and FRR, which count them, thresholds per fold and full precision are in results.csv, single runs in results.json. "-" means not measured."""  # noqa: E501
 
 
@@ -224,7 +222,6 @@ def _kinds(rows: Sequence[Row]) -> list[tuple[str, list[Row], list[Column]]]:
     """Return the tables of a data set: title, rows, columns that only this table has."""
     dimension: Column = ("m", lambda row: str(row["dim"]))
     search: Column = ("threshold search", lambda row: plain(row.get("threshold_search")))
-    bits: Column = ("bits", lambda row: count(row["dim"]))
     floor: Column = ("collision floor %", lambda row: percent(row.get("collision_floor")))
     seen: Column = ("collisions seen", _collisions)
     return [
@@ -235,7 +232,6 @@ def _kinds(rows: Sequence[Row]) -> list[tuple[str, list[Row], list[Column]]]:
             [r for r in rows if r["mode"] == "s2s"],
             [dimension, floor, seen],
         ),
-        ("Hashed templates", [r for r in rows if r["strategy"] in HASHES], [bits]),
     ]
 
 

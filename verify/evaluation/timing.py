@@ -10,7 +10,6 @@ from templates.distances import pairwise_distances
 from templates.distances.blas import single_threaded
 from templates.keys.randomness import Keystream
 from templates.space.lifting import Strategy, lift
-from verify.evaluation.baselines import hash_comparison, packed_bytes
 from verify.evaluation.material import Material
 from verify.evaluation.rows import Json, cell_json
 from verify.evaluation.units import Cell, Mode
@@ -53,11 +52,6 @@ def _of(
     probes: NDArray[np.float32],
     others: NDArray[np.float32],
 ) -> float:
-    if cell.mode is Mode.HASH:
-        generator = np.random.default_rng(0)
-        shape = (_SIDE, packed_bytes(cell.dim))
-        one, two = (generator.integers(0, 256, shape, dtype=np.uint8) for _ in range(2))
-        return _median(lambda: hash_comparison(one, two))
     attributes = None
     if cell.strategy == Strategy.HYBRID_PLUS and material.attributes is not None:
         attributes = [material.attributes[i % len(material.attributes)] for i in range(_SIDE)]

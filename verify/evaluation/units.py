@@ -6,11 +6,9 @@ from typing import Literal
 
 from templates.distances import Metric
 from templates.space.lifting import Strategy
-from verify.evaluation.baselines import Hash
 
 RAW = "raw"
 RAW_FLIP = "raw+flip"
-STOLEN = "-stolen"
 
 Search = Literal["exact", "grid"]
 Lifted = Literal["first", "second", "both"]
@@ -26,8 +24,6 @@ class Mode(StrEnum):
     """One: point to subspace."""
     SUBSPACE = "s2s"
     """Both: subspace to subspace."""
-    HASH = "hash"
-    """Both are binary codes of a baseline."""
 
 
 @dataclass(frozen=True)
@@ -37,15 +33,15 @@ class Cell:
     Parameters
     ----------
     strategy
-        A lifting strategy, ``raw``, ``raw+flip``, or a baseline with or without ``-stolen``.
+        A lifting strategy, ``raw`` or ``raw+flip``.
     decoys
         Kind of the decoy source; None without decoys.
     shared_decoys
         With a pool: whether both sides draw from all of it, or each from its own half.
     dim
-        Dimension m of subspaces; 0 for raw descriptors; bits of a code.
+        Dimension m of subspaces; 0 for raw descriptors.
     mode, metric
-        How two sides are compared; the metric of codes is ``hamming``.
+        How two sides are compared.
     """
 
     strategy: str
@@ -97,14 +93,4 @@ class LiftUnit:
     device: str | None = None
 
 
-@dataclass(frozen=True)
-class HashUnit:
-    """A baseline: all photos as binary codes under one scenario."""
-
-    scheme: Hash
-    bits: int
-    stolen: bool
-    seed: int
-
-
-Unit = RawUnit | LiftUnit | HashUnit
+Unit = RawUnit | LiftUnit

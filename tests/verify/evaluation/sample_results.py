@@ -24,7 +24,6 @@ def sample_results(
     dims: Sequence[int] = (2, 4, 8, 16),
     modes: Sequence[str] = ("p2s", "s2s"),
     metrics: Sequence[str] = ("euclidean", "spherical"),
-    hashes: bool = True,
     groups: bool = False,
     shared: Sequence[bool] = (False,),
     failures: int = 2,
@@ -55,14 +54,6 @@ def sample_results(
                                 row["collision_floor"] = dim**2 / 5000 if sharing else 0.0
                                 row["collisions_mean"] = float(rng.integers(0, 5) * dim / 4)
                             rows.append(row)
-        if hashes:
-            for strategy, value in (
-                ("biohashing", 0.9995),
-                ("biohashing-stolen", best - 0.01),
-                ("mlp-hash", 0.999),
-                ("mlp-hash-stolen", best - 0.02),
-            ):
-                rows.append(_row(rng, value, name, strategy, None, 512, "hash", "hamming"))
     made = _groups(rng, rows) if groups else ([], [])
     return {
         "format": "veilface evaluation",
@@ -157,7 +148,7 @@ def _row(
         "runs": 6 if mode == "p2s" else 3,
         "collision_floor": None,
         "collisions_mean": None,
-        "template_bytes": 2048 if not dim else 64 if mode == "hash" else 1024 * (dim + 1),
+        "template_bytes": 2048 if not dim else 1024 * (dim + 1),
         "contract_id": None if mode == "p2p" else "ef" * 16,
         "seed": 0,
     }
@@ -191,7 +182,7 @@ def _timings(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     keys = {tuple(row[name] for name in names): None for row in rows}
     timings = []
     for key in keys:
-        micro = 0.05 * (1 + key[2]) if key[3] != "hash" else 0.02
+        micro = 0.05 * (1 + key[2])
         timing = {"n": 512, "microseconds_per_comparison": micro, "ratio_to_raw": micro / 0.05}
         timings.append(dict(zip(names, key, strict=True)) | timing)
     return timings
@@ -217,7 +208,7 @@ def _groups(
     names = ("dataset", "strategy", "decoys", "shared_decoys", "dim", "mode", "metric")
     groups, summaries = [], []
     for row in rows:
-        if row["threshold_search"] != "exact" or row["mode"] == "hash":
+        if row["threshold_search"] != "exact":
             continue
         head = {name: row[name] for name in names}
         head |= {"seed": 0, "attribute": "gender", "target_fmr": 0.01, "threshold": 0.2, "runs": 3}

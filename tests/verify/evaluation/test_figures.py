@@ -160,7 +160,7 @@ def test_pool_generator_and_shared_pool_are_groups_of_their_own() -> None:
 @pytest.mark.parametrize("mode", ["p2s", "s2s"])
 @pytest.mark.parametrize("metric", ["euclidean", "spherical"])
 def test_one_mode_and_one_metric_are_enough(mode: str, metric: str) -> None:
-    results = sample_results(liftings=PAPER, modes=(mode,), metrics=(metric,), hashes=False)
+    results = sample_results(liftings=PAPER, modes=(mode,), metrics=(metric,))
     figure = verification_figure(results)
     (panel,) = drawn(figure)
     assert len(bars(panel)) == 1
@@ -239,17 +239,16 @@ def test_the_roc_shows_the_true_match_rate_over_the_logarithm() -> None:
     assert panel.get_ylim()[0] <= 100 * (1 - max(curve["fnmr"]))
 
 
-def test_a_panel_has_the_ends_of_m_raw_and_the_hashes() -> None:
+def test_a_panel_has_the_ends_of_m_and_raw() -> None:
     results = sample_results(liftings=PAPER)
     results["curves"] = [
         c for c in results["curves"] if (c["strategy"], c["dim"]) != ("hybrid", 16)
     ]
     shown = shown_curves(results["curves"], "s2s")
-    assert {c["metric"] for c in shown} == {"spherical", "hamming", "euclidean"}
+    assert {c["metric"] for c in shown} == {"spherical", "euclidean"}
     assert {c["strategy"] for c in shown if c["metric"] == "euclidean"} == {"raw"}
     lifted = {(c["strategy"], c["dim"]) for c in shown if c["mode"] == "s2s"}
     assert lifted == {(s, m) for s in ("random", "adversarial", "hybrid") for m in (2, 8)}
-    assert sum(c["mode"] == "hash" for c in shown) == 4
     assert not any(c["strategy"] == "raw+flip" for c in shown)
     for figure in (det_figure(results), roc_figure(results)):
         names = ["raw", "random", "adversarial (pool)", "hybrid (pool)"]
@@ -382,7 +381,7 @@ def test_files_are_complete_readable_and_the_same_each_time(tmp_path: Path) -> N
 
 
 def test_a_figure_without_content_is_left_out(tmp_path: Path) -> None:
-    only_raw = sample_results(liftings=(), hashes=False)
+    only_raw = sample_results(liftings=())
     names = [path.name for path in write_figures(only_raw, tmp_path)]
     assert names == ["det.png", "det.svg", "roc.png", "roc.svg"]
     only_raw["curves"] = []
@@ -425,17 +424,6 @@ def test_whiskers_above_100_are_seen_and_no_tick_is() -> None:
     (panel,) = drawn(verification_figure(results))
     assert panel.get_ylim()[1] > 100.3
     assert max(panel.get_yticks()) == 100
-
-
-def test_hashes_do_not_set_the_scale_of_the_roc() -> None:
-    results = sample_results(liftings=PAPER, modes=("p2s",))
-    before = drawn(roc_figure(results))[0].get_ylim()
-    for curve in results["curves"]:
-        if curve["strategy"] == "mlp-hash-stolen":
-            curve["fnmr"] = np.linspace(1, 0, len(curve["fnmr"])).tolist()
-    assert drawn(roc_figure(results))[0].get_ylim() == before
-    results["curves"] = [curve for curve in results["curves"] if curve["mode"] == "hash"]
-    assert drawn(roc_figure(results))[0].get_ylim()[0] == 0
 
 
 def test_no_rate_that_was_seen_lies_below_the_det() -> None:

@@ -10,10 +10,9 @@ from templates.errors import TemplateError
 from templates.keys.randomness import Keystream
 from templates.space.lifting import Strategy, lift
 from tests.verify.evaluation.materials import N, material, pool
-from verify.evaluation.baselines import Hash
 from verify.evaluation.material import Material
 from verify.evaluation.scoring import score_unit, split_pool, unit_layout
-from verify.evaluation.units import HashUnit, LiftUnit, Mode, RawUnit
+from verify.evaluation.units import LiftUnit, Mode, RawUnit
 
 BOTH = (Mode.POINT, Mode.SUBSPACE)
 
@@ -177,19 +176,3 @@ def test_hybrid_plus_takes_the_attributes_of_each_photo(monkeypatch: pytest.Monk
     without = Material(**{**vars(known), "attributes": None})
     with pytest.raises(ValueError, match="attributes"):
         score_unit(without, unit(Strategy.HYBRID_PLUS))
-
-
-def test_codes_are_compared_in_both_scenarios() -> None:
-    known = material()
-    normal, stolen = (
-        score_unit(known, HashUnit(Hash.BIOHASHING, N, stolen, 0))[0] for stolen in (False, True)
-    )
-    assert normal.cell.strategy == "biohashing"
-    assert stolen.cell.strategy == "biohashing-stolen"
-    (raw,) = score_unit(known, RawUnit(flip=False))
-    # Under one token a bit of two vectors differs with the probability of their angle over pi.
-    expected = 1 - np.arccos(raw.similarities) / np.pi
-    assert abs((stolen.similarities - expected).mean()) < 0.03
-    assert abs((normal.similarities - expected)[known.same].mean()) < 0.03
-    # Under two tokens codes of strangers agree in half of their bits, however alike they are.
-    assert abs(normal.similarities[~known.same].mean() - 0.5) < 0.05

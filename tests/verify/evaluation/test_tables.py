@@ -50,22 +50,20 @@ def test_the_csv_has_each_row_with_its_numbers_in_full(tmp_path: Path) -> None:
 
 def test_the_csv_joins_the_timing_of_the_same_configuration(tmp_path: Path) -> None:
     results = sample_results(dims=(2, 4))
-    results["timings"] = [
-        timing for timing in results["timings"] if timing["strategy"] != "biohashing"
-    ]
+    results["timings"] = [timing for timing in results["timings"] if timing["strategy"] != "random"]
     write_csv(results, tmp_path / "r.csv")
     for line in read(tmp_path / "r.csv"):
-        if line["strategy"] == "biohashing":
+        if line["strategy"] == "random":
             assert line["microseconds_per_comparison"] == ""
         else:
-            expected = 0.02 if line["mode"] == "hash" else 0.05 * (1 + int(line["dim"]))
+            expected = 0.05 * (1 + int(line["dim"]))
             assert float(line["microseconds_per_comparison"]) == pytest.approx(expected)
         assert "timing_n" not in line
 
 
 @pytest.mark.parametrize("text", ["=1+1", "+1", "-1", "@SUM(A1)", "\tx", "\rx"])
 def test_the_csv_holds_no_formula(tmp_path: Path, text: str) -> None:
-    results = sample_results(dims=(2,), hashes=False)
+    results = sample_results(dims=(2,))
     for row in results["rows"]:
         row |= {"dataset": text, "d_prime": -0.25, "thresholds": [-0.5, -1e-9]}
     write_csv(results, tmp_path / "r.csv")
@@ -79,7 +77,7 @@ def test_the_csv_holds_no_formula(tmp_path: Path, text: str) -> None:
 
 
 def test_the_csv_quotes_what_would_break_it(tmp_path: Path) -> None:
-    results = sample_results(dims=(2,), hashes=False)
+    results = sample_results(dims=(2,))
     for row in results["rows"]:
         row["dataset"] = 'my "set", of\nfaces'
     write_csv(results, tmp_path / "r.csv")
@@ -94,7 +92,6 @@ def test_the_report_has_a_table_for_each_kind_of_comparison() -> None:
         "Raw embeddings": lambda r: r["strategy"].startswith("raw"),
         "Point to subspace (p-to-s)": lambda r: r["mode"] == "p2s",
         "Subspace to subspace (s-to-s)": lambda r: r["mode"] == "s2s",
-        "Hashed templates": lambda r: r["mode"] == "hash",
     }
     for title, belongs in counts.items():
         table = section(report, title)
@@ -143,7 +140,7 @@ def test_a_line_of_the_report_says_what_its_row_says() -> None:
 
 
 def test_what_was_not_measured_is_a_dash() -> None:
-    results = sample_results(dims=(2,), hashes=False, liftings=(("random", None),))
+    results = sample_results(dims=(2,), liftings=(("random", None),))
     results["timings"] = []
     row = find(results, mode="p2s", metric="spherical")
     row |= {"accuracy_mean": None, "eer": None, "auc": None, "d_prime": None}
@@ -177,7 +174,7 @@ def test_the_kind_of_interval_is_named(interval: str, words: str) -> None:
         for rate in row["fnmr_at_fmr"].values():
             rate["interval"] = interval
     report, reading = markdown(results).split("## How to read this")
-    assert report.count(f"intervals: {words}.") == 4
+    assert report.count(f"intervals: {words}.") == 3
     assert words in reading
 
 
@@ -187,16 +184,10 @@ def test_the_spread_over_seeds_is_shown_where_there_are_two() -> None:
 
 
 def test_a_separation_may_be_negative() -> None:
-    results = sample_results(dims=(2,), hashes=False, liftings=(("random", None),))
+    results = sample_results(dims=(2,), liftings=(("random", None),))
     find(results, mode="p2s", metric="spherical")["d_prime"] = -0.128
     table = section(markdown(results), "Point to subspace (p-to-s)")
     assert "-0.13" in column(table, "d'")
-
-
-def test_the_report_says_what_mlp_hash_is() -> None:
-    report = markdown(sample_results(dims=(2,)))
-    said = "Rows of mlp-hash are of a reconstruction from the published description"
-    assert f"{said} (docs/evaluation.md)" in report
 
 
 def test_failures_to_acquire_are_listed_up_to_twenty() -> None:
@@ -240,7 +231,7 @@ def test_the_worst_group_is_named_with_its_counts() -> None:
     report = by_group(
         [similarities], same, labels, labels, attribute="gender", thresholds=[0.5], target_fmr=0.01
     )
-    results = sample_results(dims=(2,), hashes=False)
+    results = sample_results(dims=(2,))
     row = find(results, strategy="hybrid", mode="s2s", metric="spherical")
     names = ("dataset", "strategy", "decoys", "shared_decoys", "dim", "mode", "metric")
     head = {name: row[name] for name in names} | {"seed": 0}
@@ -265,7 +256,7 @@ def test_the_worst_group_is_named_with_its_counts() -> None:
 
 
 def test_a_group_that_is_not_judged_is_marked() -> None:
-    results = sample_results(dims=(2,), groups=True, hashes=False, modes=("p2s",))
+    results = sample_results(dims=(2,), groups=True, modes=("p2s",))
     for group in results["groups"]:
         if group["group"] == "Male":
             group["fnmr"] = {"value": None, "errors": 0, "trials": 0, "judged": False}

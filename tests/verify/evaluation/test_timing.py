@@ -18,16 +18,12 @@ FLIP = Cell("raw+flip", None, None, 0, Mode.RAW, Metric.EUCLIDEAN.value)
 POINT = Cell("random", None, None, 2, Mode.POINT, SPHERICAL)
 SPACE = Cell("adversarial", "pool", False, 4, Mode.SUBSPACE, Metric.EUCLIDEAN.value)
 BALANCED = Cell("hybrid+", "pool", True, 2, Mode.SUBSPACE, SPHERICAL)
-CODES = Cell("biohashing", None, None, N, Mode.HASH, "hamming")
-STOLEN = Cell("mlp-hash-stolen", None, None, N, Mode.HASH, "hamming")
 CELLS = [
     (RAW, None),
     (FLIP, None),
     (POINT, None),
     (SPACE, 0),
     (BALANCED, 0),
-    (CODES, None),
-    (STOLEN, None),
 ]
 
 

@@ -23,7 +23,6 @@ from verify.evaluation.figures.style import (
     side_legend,
 )
 from verify.evaluation.row_labels import (
-    HASHES,
     LIFTED_MODES,
     METRIC_NAMES,
     MODE_NAMES,
@@ -40,7 +39,6 @@ SMALLEST = 1e-7
 BAND_ALPHA = 0.11
 PANEL_INCHES = (4.6, 4.3)
 SIDE_INCHES = 2.75
-HASH_HUES = dict(zip(HASHES, ("#8c8c8c", "#8c8c8c", "#5e5e5e", "#5e5e5e"), strict=True))
 EQUAL: dict[str, Any] = {"color": QUIET, "linewidth": 0.9}
 Draw = Callable[[Axes, Array, Array, Array, Array, dict[str, Any]], None]
 
@@ -50,7 +48,7 @@ def det_figure(results: Mapping[str, Any]) -> Figure | None:
 
     One panel for each data set and mode. The metric is spherical where it was run, and of the
     dimensions the smallest and the largest that all strategies of the panel have; raw descriptors
-    and hashes are in every panel as references. Bands are 95 %.
+    are in every panel as a reference. Bands are 95 %.
     """
     return _figure(results, draw_det, dress_det)
 
@@ -73,13 +71,9 @@ def shown_curves(curves: Sequence[Row], mode: str) -> list[Row]:
         dims = shared or by_group[strategy_label(curve)]
         by_group[strategy_label(curve)] = {min(dims), max(dims)}
     lifted = [c for c in lifted if int(c["dim"]) in by_group[strategy_label(c)]]
-    hashes = [curve for curve in curves if curve["mode"] == "hash"]
-    longest = max((int(curve["dim"]) for curve in hashes), default=0)
     raw = [curve for curve in curves if curve["strategy"] == "raw"]
     raw = [curve for curve in raw if curve["metric"] == preferred_metric(raw)]
-    return sorted(
-        raw + lifted + [curve for curve in hashes if int(curve["dim"]) == longest], key=order_of
-    )
+    return sorted(raw + lifted, key=order_of)
 
 
 def _figure(results: Row, draw: Draw, dress: Callable[[Axes], None]) -> Figure | None:
@@ -87,9 +81,9 @@ def _figure(results: Row, draw: Draw, dress: Callable[[Axes], None]) -> Figure |
     names = [name for name in datasets_of(results) if any(c["dataset"] == name for c in curves)]
     present = {curve["mode"] for curve in curves}
     modes = [mode for mode in LIFTED_MODES if mode in present]
-    # Without lifting the references alone make one panel.
-    modes = modes or [mode for mode in ("p2p", "hash") if mode in present][:1]
-    if not names or not modes:
+    # Without lifting the reference alone makes one panel.
+    modes = modes or ["p2p"]
+    if not names:
         return None
     with house_style():
         width, height = PANEL_INCHES
@@ -129,13 +123,6 @@ def _look(curve: Row, shown: Sequence[Row], looks: dict[str, dict[str, Any]]) ->
     label = strategy_label(curve)
     if curve["strategy"] == "raw":
         looks.setdefault(label, {"color": INK, "linewidth": 2.2, "zorder": 4})
-    elif curve["mode"] == "hash":
-        stolen = str(curve["strategy"]).endswith("-stolen")
-        looks.setdefault(
-            label,
-            {"color": HASH_HUES.get(curve["strategy"], QUIET), "linewidth": 1.5}
-            | {"linestyle": DASHES[2] if stolen else DASHES[3]},
-        )
     else:
         lifted = [look for look in looks.values() if "marker" in look]
         number = len(lifted) % len(HUES)
@@ -212,9 +199,7 @@ def _dress_roc(axes: Axes) -> None:
     lines = axes.get_lines()
     axes.set_xscale("log")
     axes.set_xlim(min(float(np.min(np.asarray(line.get_xdata()))) for line in lines), 1)
-    # A hash far below the others leaves through the foot: it would flatten them all.
-    scaled = [line for line in lines if line.get_color() not in HASH_HUES.values()] or lines
-    lowest = min(float(np.min(np.asarray(line.get_ydata()))) for line in scaled)
+    lowest = min(float(np.min(np.asarray(line.get_ydata()))) for line in lines)
     floor = next((f for f in (98.0, 95.0, 90.0, 80.0, 50.0) if lowest >= f), 0.0)
     axes.set_ylim(floor, 100 + (100 - floor) * 0.02)
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: _percent(value)))
