@@ -85,31 +85,23 @@ def cell(rows: Sequence[Sequence[object]]) -> np.ndarray:
 
 
 def agedb_splits(layout: str, folds: Sequence[Sequence[tuple[str, str, int]]]) -> np.ndarray:
-    """``splits`` as read by public converters (``published``), or in another plausible layout."""
+    """``splits`` as the published file has it, or with a cell in place of each struct."""
     made = []
     for pairs in folds:
         labels = np.array([[label for *_, label in pairs]])
-        match layout:
-            case "published":
-                photos = [[{"name": pair[side], "age": 30} for pair in pairs] for side in (0, 1)]
-                made.append({"pairs": cell(photos), "labels": labels})
-            case "columns":
-                made.append({"labels": labels.T, "pairs": cell([pair[:2] for pair in pairs])})
-            case "two cells":
-                first, second = (cell([[pair[side]] for pair in pairs]) for side in (0, 1))
-                made.append({"first": first, "second": second, "label": labels.astype(float)})
-            case "table":
-                made.append(cell(pairs))
-            case "pair of cells":
-                photos = cell([[pair[side] for pair in pairs] for side in (0, 1)])
-                made.append(cell([[photos, labels]]))
+        if layout == "structs":
+            photos = [[{"name": pair[side], "age": 30} for pair in pairs] for side in (0, 1)]
+            made.append({"pairs": cell(photos), "labels": labels})
+        else:
+            photos = [[pair[side] for pair in pairs] for side in (0, 1)]
+            made.append(cell([[cell(photos), labels]]))
     return cell([[one] for one in made])
 
 
 def agedb_folder(
     root: Path,
     *,
-    layout: str = "published",
+    layout: str = "structs",
     folds: Sequence[Sequence[tuple[str, str, int]]] | None = None,
     compressed: bool = True,
     photos: bool = True,

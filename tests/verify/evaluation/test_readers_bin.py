@@ -14,6 +14,8 @@ from verify.evaluation.readers import notes, open_sets
 from verify.evaluation.verification_set import VerificationSet
 from verify.tenfold import FOLDS
 
+pytestmark = pytest.mark.usefixtures("in_this_process")
+
 
 def read(file: Path, content: object, protocol: int = 4) -> VerificationSet:
     file.write_bytes(pickle.dumps(content, protocol))
@@ -113,17 +115,12 @@ BINS, SAME = bin_content()
         (([np.zeros(8), *BINS[1:]], SAME), "other elements than integers"),
         (([np.array(["a"], object), *BINS[1:]], SAME), "photo 0 is an array"),
         ((np.array([*BINS[:-1], None], object), SAME), "photo 39 is neither bytes"),
-        (({"bins": BINS}, SAME), "not one that plain values need"),
+        (({"bins": BINS}, SAME), "bins, is not a list"),
     ],
 )
 def test_faults_are_named(tmp_path: Path, content: object, message: str) -> None:
     with pytest.raises(DatasetError, match=message):
         read(tmp_path / "lfw.bin", content)
-
-
-def test_every_faulty_photo_is_listed_up_to_twenty(tmp_path: Path) -> None:
-    with pytest.raises(DatasetError, match=r"40 faults.*photo 19 .*and 20 more"):
-        read(tmp_path / "lfw.bin", ([b"no photo"] * 40, SAME))
 
 
 class Touches:

@@ -1,13 +1,12 @@
 """InsightFace's ``.bin``: a pickle of encoded photos and of the answers to their pairs."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
-from verify.datasets import DatasetError, faults_in, read_whole
+from verify.datasets import DatasetError, read_whole
 from verify.evaluation.readers.assembly import Trial, assemble
-from verify.evaluation.readers.pickled_arrays import PickledArray, RefusedPickle
-from verify.evaluation.readers.restricted_pickle import read_pickle
+from verify.evaluation.readers.isolated import isolated
+from verify.evaluation.readers.plain_pickle import PickledArray, RefusedPickle, read_pickle
 from verify.evaluation.verification_set import (
     PictureBytes,
     VerificationSet,
@@ -33,31 +32,7 @@ def read_bin(path: Path) -> VerificationSet:
     DatasetError
         Naming what is wrong. Nothing in the file is run, whatever it holds.
     """
-    try:
-        data = read_whole(path, most=MAX_BIN_BYTES)
-        content = read_pickle(data)
-    except RefusedPickle as error:
-        raise DatasetError(f"{path} is not a readable InsightFace .bin: {error}") from None
-    except MemoryError:
-        raise DatasetError(f"{path} needs more memory than this machine has") from None
-    sha256 = digest_of(data)
-    del data
-    if not isinstance(content, tuple | list) or len(content) != 2:
-        raise DatasetError(f"{path} does not hold the two parts (bins, issame_list)")
-    bins, answers = map(_listed, content)
-    if not isinstance(bins, tuple | list):
-        raise DatasetError(f"{path}: its first part, bins, is not a list of photos")
-    same = _answers(path, answers)
-    if len(bins) % 2:
-        raise DatasetError(f"{path} has an odd number of photos, {len(bins)}; pairs need two each")
-    if len(bins) != 2 * len(same):
-        raise DatasetError(
-            f"{path} has {len(bins)} photos and {len(same)} answers; "
-            f"{len(same)} pairs need {2 * len(same)} photos"
-        )
-    if not same:
-        raise DatasetError(f"{path} holds no pair")
-    photos = _photos(path, bins)
+    photos, same, sha256 = isolated(read_content, path)
     named, content_of = _named(photos)
     trials = [
         Trial(named[2 * pair], named[2 * pair + 1], answer, int(fold))
@@ -76,29 +51,64 @@ def read_bin(path: Path) -> VerificationSet:
     )
 
 
+def read_content(path: Path) -> tuple[list[bytes], list[bool], str]:
+    """Return the photos, the answers and the SHA-256 of a file.
+
+    Raises
+    ------
+    DatasetError
+        As of :func:`read_bin`.
+    """
+    data = read_whole(path, most=MAX_BIN_BYTES)
+    try:
+        content = read_pickle(data)
+        if not isinstance(content, tuple | list) or len(content) != 2:
+            raise DatasetError(f"{path} does not hold the two parts (bins, issame_list)")
+        bins, answers = map(_listed, content)
+    except RefusedPickle as error:
+        raise DatasetError(f"{path} is not a readable InsightFace .bin: {error}") from None
+    if not isinstance(bins, tuple | list):
+        raise DatasetError(f"{path}: its first part, bins, is not a list of photos")
+    if not isinstance(answers, tuple | list):
+        raise DatasetError(f"{path}: its second part, issame_list, is not a list")
+    if len(bins) % 2:
+        raise DatasetError(f"{path} has an odd number of photos, {len(bins)}; pairs need two each")
+    if len(bins) != 2 * len(answers):
+        raise DatasetError(
+            f"{path} has {len(bins)} photos and {len(answers)} answers; "
+            f"{len(answers)} pairs need {2 * len(answers)} photos"
+        )
+    if not answers:
+        raise DatasetError(f"{path} holds no pair")
+    for place, answer in enumerate(answers):
+        if not isinstance(answer, int) or answer not in (0, 1):
+            raise DatasetError(f"{path}: answer {place} is neither true nor false")
+    return _photos(path, bins), [bool(answer) for answer in answers], digest_of(data)
+
+
 def _listed(part: object) -> object:
-    """Look through an array of objects, as ``np.array(photos, dtype=object)`` is."""
-    return part.items if isinstance(part, PickledArray) and part.items is not None else part
+    """Return the elements of an array: numbers, or objects as of ``np.array(…, dtype=object)``."""
+    if not isinstance(part, PickledArray):
+        return part
+    if isinstance(part.content, list):
+        return part.content
+    return part.type.numbers(part.content) if len(part.shape) == 1 else None
 
 
-def _photos(path: Path, bins: tuple[object, ...] | list[object]) -> list[bytes]:
+def _photos(path: Path, bins: Sequence[object]) -> list[bytes]:
     photos: list[bytes] = []
-    faults: list[str] = []
     for place, element in enumerate(bins):
         if isinstance(element, PickledArray):
-            flat = max(element.shape, default=0) == len(element.data or b"")
-            if element.dtype is None or element.dtype.code != "u1" or not flat:
-                faults.append(f"photo {place} is an array, but not one row of bytes (uint8)")
-                continue
-            element = element.data
-        if not isinstance(element, bytes):
-            faults.append(f"photo {place} is neither bytes nor an array")
-        elif not element.startswith(_SIGNATURES):
-            faults.append(f"photo {place} is neither JPEG nor PNG")
-        else:
-            photos.append(element)
-    if faults:
-        raise DatasetError(faults_in(path, "expected encoded photos", faults))
+            row = max(element.shape, default=0) == len(element.content)
+            if element.type.code != "u1" or not row:
+                raise DatasetError(f"{path}: photo {place} is an array, but not one row of uint8")
+            element = element.content
+        if not isinstance(element, bytes | bytearray):
+            raise DatasetError(f"{path}: photo {place} is neither bytes nor an array")
+        if not element.startswith(_SIGNATURES):
+            raise DatasetError(f"{path}: photo {place} is neither JPEG nor PNG")
+        # Bytes that are said again stay one object, here and on their way out of the process.
+        photos.append(element if isinstance(element, bytes) else bytes(element))
     return photos
 
 
@@ -118,18 +128,3 @@ def _named(photos: list[bytes]) -> tuple[list[str], dict[str, bytes]]:
             name_of_object[id(photo)] = name
         named.append(name)
     return named, {name: photo for photo, name in names.items()}
-
-
-def _answers(path: Path, answers: object) -> list[bool]:
-    if isinstance(answers, PickledArray) and answers.dtype is not None and len(answers.shape) == 1:
-        order = answers.dtype.order.replace("=", "<")
-        answers = np.frombuffer(answers.data or b"", f"{order}{answers.dtype.code}").tolist()
-    if not isinstance(answers, tuple | list):
-        raise DatasetError(f"{path}: its second part, issame_list, is not a list")
-    wrong = [
-        place for place, one in enumerate(answers) if not isinstance(one, int) or one not in (0, 1)
-    ]
-    if wrong:
-        faults = [f"answer {place} is neither true nor false" for place in wrong]
-        raise DatasetError(faults_in(path, "expected issame_list of booleans", faults))
-    return [bool(one) for one in answers]
