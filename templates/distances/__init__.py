@@ -267,7 +267,8 @@ def paired_distances(
 ) -> Floats:
     """Distances of probe i to template i, computed in float64 whatever ``dtype`` is.
 
-    Parameters and errors are those of `pairwise_distances`.
+    Under `on_device`, float32 distances of lifted probes are computed there. Parameters and errors
+    are those of `pairwise_distances`.
 
     Parameters
     ----------
@@ -283,6 +284,12 @@ def paired_distances(
     probes = _checked(probes, templates, dtype)
     if len(probes) != len(templates):
         raise TemplateError(f"{len(probes)} probes do not pair with {len(templates)} templates")
+    device = None if np.dtype(dtype) == np.float64 else _DEVICE.get()
+    if device is not None and isinstance(probes, SubspaceBatch):
+        distances: Floats = _torch().paired(
+            probes, templates, metric=metric, steps=steps, device=device
+        )
+        return distances
     every = np.arange(len(probes))
     return exact.pairs(
         probes, templates, every, every, metric=metric, steps=steps, as_stored=as_stored

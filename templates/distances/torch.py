@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from templates.distances import exact
@@ -68,12 +69,33 @@ def tiles(
         for rows in parts(len(probes), height):
             left = stacked(probes[rows], metric, there)
             with ieee_products(there):
-                out = distances(left, right, metric=metric, steps=steps).cpu().numpy()
+                products = left.rows.flatten(0, 1) @ right.rows.flatten(0, 1).T
+                shape = len(left.rows), rows.stop - rows.start, wide, columns.stop - columns.start
+                block = products.view(shape).permute(1, 3, 0, 2)
+                squares = left.squares[:, None], right.squares
+                out = _distances(block, *squares, metric=metric, steps=steps).cpu().numpy()
             i, j = np.nonzero(~((out >= NEAR) & (out < np.inf)))
             if i.size:
                 sides = probes[rows], templates[columns]
                 out[i, j] = exact.pairs(*sides, i, j, metric=metric, steps=steps)
             yield rows, columns, out
+
+
+def paired(
+    probes: SubspaceBatch, templates: SubspaceBatch, *, metric: Metric, steps: int, device: str
+) -> NDArray[np.float32]:
+    """Distances of lifted probe i to template i, (P,)."""
+    there, out = usable(device), np.empty(len(probes), dtype=np.float32)
+    numbers = (probes.m + templates.m + 2) * probes.n
+    for part in parts(len(out), max(1, _TILE_BYTES.get(there.type, 128 << 20) // 4 // numbers)):
+        left, right = (stacked(side[part], metric, there) for side in (probes, templates))
+        with ieee_products(there):
+            block = left.rows.transpose(0, 1) @ right.rows.permute(1, 2, 0)
+            squares = left.squares, right.squares
+            out[part] = _distances(block, *squares, metric=metric, steps=steps).cpu().numpy()
+    near = np.flatnonzero(~((out >= NEAR) & (out < np.inf)))
+    out[near] = exact.pairs(probes, templates, near, near, metric=metric, steps=steps)
+    return out
 
 
 def stacked(side: Probes, metric: Metric, device: torch.device) -> Rows:
@@ -122,24 +144,30 @@ def ieee_products(device: torch.device) -> Iterator[None]:
                 backend.fp32_precision = precision
 
 
-def distances(left: Rows, right: Rows, *, metric: Metric, steps: int) -> Tensor:
-    """Distances (P, T) of stacked rows, without a guarantee for those that float32 gets wrong.
+def _distances(
+    products: Tensor, own: Tensor, squares: Tensor, *, metric: Metric, steps: int
+) -> Tensor:
+    """Distances from the products (…, m_D + 1, m_E + 1) of every pair, in their shape.
 
     What is nearer than 0.1, NaN or infinite has to be computed by ``exact``.
+
+    Parameters
+    ----------
+    own, squares
+        Squared lengths of points or feet, of both sides, in shapes that broadcast.
     """
-    deep, count, n = left.rows.shape
-    wide, others = right.rows.shape[:2]
-    gram = (left.rows.view(-1, n) @ right.rows.view(-1, n).T).view(deep, count, wide, others)
-    block = gram.permute(1, 3, 0, 2).flatten(0, 1).contiguous()  # (pairs, m_D + 1, m_E + 1)
+    shape = products.shape[:-2]
+    block = products.reshape(-1, *products.shape[-2:])
+    points = block.shape[1] == 1
     if metric is Metric.SPHERICAL:
-        gains = block[:, 0, 1:].norm(dim=1) if deep == 1 else _gains(block, steps)
-        squared = 2 - 2 * (block[:, 0, 0] + gains)
-        if deep == 1:  # a zero probe has no direction: similarity 0 with everything
-            squared = torch.where((left.squares > 0).repeat_interleave(others), squared, 2.0)
+        gains = block[:, 0, 1:].norm(dim=1) if points else _gains(block, steps)
+        squared = (2 - 2 * (block[:, 0, 0] + gains)).view(shape)
+        if points:  # a zero probe has no direction: similarity 0 with everything
+            squared = torch.where(own > 0, squared, 2.0)
     else:
-        gaps = (left.squares[:, None] + right.squares).flatten() - 2 * block[:, 0, 0]
-        squared = gaps - block[:, 0, 1:].square().sum(dim=1) if deep == 1 else _schur(block, gaps)
-    return squared.clamp(min=0).sqrt().view(count, others)
+        gaps = (own + squares).flatten() - 2 * block[:, 0, 0]
+        squared = gaps - block[:, 0, 1:].square().sum(dim=1) if points else _schur(block, gaps)
+    return squared.clamp(min=0).sqrt().view(shape)
 
 
 def _schur(block: Tensor, gaps: Tensor) -> Tensor:
