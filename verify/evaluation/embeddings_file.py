@@ -1,27 +1,19 @@
 """Descriptors that were computed elsewhere, and the photos of a set that they belong to."""
 
 import hashlib
-import math
-import zipfile
-from collections import defaultdict
-from collections.abc import Iterator, Sequence, Set
+from collections import Counter, defaultdict
+from collections.abc import Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from verify.datasets import SUFFIXES, DatasetError, faults_in
+from verify.evaluation.readers.isolated import isolated
 from verify.evaluation.verification_set import VerificationSet
 
-MAX_DESCRIPTOR_BYTES = 2**30
-MAX_PATH_BYTES = 2**29
-MAX_ROWS = 1_000_000
-MAX_DIMENSION = 2**16
-_MAX_HEADER = 10_000
-_BLOCK_BYTES = 2**22
-_COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+_NAMES = ("paths", "descriptors")
 _SHOWN = 3
 _FLOATS = (np.dtype(np.float16), np.dtype(np.float32), np.dtype(np.float64))
 _KEYS = "expected arrays paths (unicode) and descriptors (float16, float32 or float64)"
@@ -53,8 +45,7 @@ class EmbeddingsFile:
 def read_embeddings(file: Path) -> EmbeddingsFile:
     """Read an ``.npz`` with ``paths`` (N unicode strings) and ``descriptors`` (N, n).
 
-    Rows are normalised, as many tools save what the network gave. What both arrays declare is
-    checked before either is unpacked, and they are unpacked a block at a time.
+    Rows are normalised, as many tools save what the network gave.
 
     Raises
     ------
@@ -62,29 +53,50 @@ def read_embeddings(file: Path) -> EmbeddingsFile:
         The archive is broken or too large, an array has another type or shape, a row is zero or
         not finite, or a path occurs twice.
     """
+    return isolated(read_content, file)
+
+
+def read_content(file: Path) -> EmbeddingsFile:
+    """Read as :func:`read_embeddings` does, in this process."""
     try:
         with file.open("rb") as stream:
             sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
-            with zipfile.ZipFile(stream) as archive:
-                paths = _declared(file, archive, "paths", most=MAX_PATH_BYTES)
-                rows = _declared(file, archive, "descriptors", most=MAX_DESCRIPTOR_BYTES)
-                _require_shapes(file, paths.shape, rows.shape)
-                names = [str(one) for block in _blocks(archive, paths) for one in block.tolist()]
-                unit, lengths = _unit_rows(archive, rows)
-    except DatasetError:
-        raise
+            stream.seek(0)
+            with np.load(stream, allow_pickle=False) as archive:
+                arrays = {name: archive[name] for name in _NAMES if name in archive.files}
+                there = archive.files
     except OSError as error:
         raise DatasetError(f"{file} cannot be read: {error.strerror or 'broken'}") from None
+    except MemoryError:
+        raise
     except Exception as error:  # zipfile and NumPy raise whatever a broken archive causes
         raise DatasetError(
             f"{file} is not a readable .npz archive ({type(error).__name__}); {_KEYS}"
         ) from None
-    faults = [f"{name!a} occurs twice" for name in _repeated(names)]
-    for place in np.flatnonzero(~(np.isfinite(lengths) & (lengths > 0))).tolist():
-        state = "zero" if lengths[place] == 0 else "not finite"
-        faults.append(f"the embedding of {names[place]!a} is {state}")
-    if faults:
-        raise DatasetError(faults_in(file, "expected one embedding per photo", faults))
+    for name in _NAMES:
+        if name not in arrays:
+            raise DatasetError(f"{file} has no array {name}, only {', '.join(there)!a}; {_KEYS}")
+    paths, rows = (np.asarray(arrays[name]) for name in _NAMES)
+    for name, array, fits in (
+        ("paths", paths, paths.dtype.kind == "U"),
+        ("descriptors", rows, rows.dtype.newbyteorder("=") in _FLOATS),
+    ):
+        if not fits:
+            raise DatasetError(f"{file}: {name} is of type {array.dtype}; {_KEYS}")
+    if paths.ndim != 1 or rows.ndim != 2 or len(paths) != len(rows) or 0 in rows.shape:
+        raise DatasetError(
+            f"{file} has paths of shape {paths.shape} and descriptors of shape {rows.shape}; "
+            "expected (N,) and (N, n)"
+        )
+    names = [str(name) for name in paths.tolist()]
+    if repeated := next((name for name, times in Counter(names).items() if times > 1), None):
+        raise DatasetError(f"{file}: {repeated!a} occurs twice")
+    lengths = np.sqrt(np.einsum("ij,ij->i", rows, rows, dtype=np.float64))
+    wrong = np.flatnonzero(~(np.isfinite(lengths) & (lengths > 0)))
+    if wrong.size:
+        state = "zero" if lengths[wrong[0]] == 0 else "not finite"
+        raise DatasetError(f"{file}: the embedding of {names[wrong[0]]!a} is {state}")
+    unit = np.ascontiguousarray(rows / lengths[:, None], dtype=np.float32)
     return EmbeddingsFile(tuple(names), unit, sha256)
 
 
@@ -185,115 +197,3 @@ def _components(path: str) -> tuple[str, ...]:
         if dot > 0 and pieces[-1][dot:].lower() in SUFFIXES:
             pieces[-1] = pieces[-1][:dot]
     return tuple(pieces)
-
-
-def _repeated(names: list[str]) -> list[str]:
-    seen: set[str] = set()
-    return [name for name in names if name in seen or seen.add(name)]  # type: ignore[func-returns-value]
-
-
-@dataclass(frozen=True, repr=False)
-class _Declared:
-    """An array of an archive, as its header has it; ``start`` is where the numbers begin."""
-
-    entry: zipfile.ZipInfo
-    shape: tuple[int, ...]
-    fortran: bool
-    dtype: np.dtype[np.generic]
-    start: int
-
-
-def _declared(file: Path, archive: zipfile.ZipFile, name: str, *, most: int) -> _Declared:
-    """Read the header of one array, and check it against what the archive says of the entry."""
-    try:
-        entry = archive.getinfo(f"{name}.npy")
-    except KeyError:
-        there = ", ".join(sorted(archive.namelist())[:5])
-        raise DatasetError(f"{file} has no array {name}, only {there!a}; {_KEYS}") from None
-    if entry.compress_type not in _COMPRESSIONS:
-        # zipfile unpacks others past any size that is asked for.
-        raise DatasetError(
-            f"{file}: {name} is compressed otherwise than NumPy does; save it with "
-            "numpy.savez or numpy.savez_compressed"
-        )
-    if entry.file_size > most:
-        raise DatasetError(f"{file}: {name} unpacks to more than {most} bytes")
-    with archive.open(entry) as stream:
-        shape, fortran, dtype = _header(stream)
-        start = stream.tell()
-    if dtype.kind != "U" if name == "paths" else dtype.newbyteorder("=") not in _FLOATS:
-        raise DatasetError(f"{file}: {name} is of type {dtype.kind}{dtype.itemsize}; {_KEYS}")
-    size = math.prod(shape) * dtype.itemsize
-    if min(shape, default=0) < 0 or size > most:
-        raise DatasetError(f"{file}: {name} declares a shape beyond {most} bytes")
-    if entry.file_size != start + size:
-        raise DatasetError(f"{file}: {name} is not as long as its shape {shape} says")
-    return _Declared(entry, shape, fortran, dtype, start)
-
-
-def _require_shapes(file: Path, paths: tuple[int, ...], rows: tuple[int, ...]) -> None:
-    if len(paths) != 1 or len(rows) != 2 or paths[0] != rows[0] or 0 in rows:
-        raise DatasetError(
-            f"{file} has paths of shape {paths} and descriptors of shape {rows}; "
-            "expected (N,) and (N, n)"
-        )
-    if rows[0] > MAX_ROWS or rows[1] > MAX_DIMENSION:
-        raise DatasetError(
-            f"{file} has {rows[0]} embeddings of {rows[1]} numbers each; at most {MAX_ROWS} of "
-            f"{MAX_DIMENSION} are read"
-        )
-
-
-def _blocks(archive: zipfile.ZipFile, array: _Declared) -> Iterator[NDArray[np.generic]]:
-    """Unpack an array some rows at a time, or some columns where it lies in Fortran order."""
-    shape = array.shape[::-1] if array.fortran else array.shape
-    width = math.prod(shape[1:])
-    step = max(1, _BLOCK_BYTES // max(1, width * array.dtype.itemsize))
-    with archive.open(array.entry) as stream:
-        stream.read(array.start)
-        for first in range(0, shape[0], step):
-            count = min(step, shape[0] - first)
-            data = stream.read(count * width * array.dtype.itemsize)
-            if array.dtype.itemsize == 0:
-                block: NDArray[np.generic] = np.zeros((count, *shape[1:]), "U1")
-            else:
-                block = np.frombuffer(data, array.dtype).reshape(count, *shape[1:])
-            yield block
-        if stream.read(1):
-            raise ValueError("an entry is longer than it declares")
-
-
-def _unit_rows(
-    archive: zipfile.ZipFile, array: _Declared
-) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-    """Rows over their lengths, and the lengths; rows without a length are undefined."""
-    count = array.shape[0]
-    unit = np.empty(array.shape, dtype=np.float32)
-    lengths = np.zeros(count, dtype=np.float64)
-    at = 0
-    with np.errstate(all="ignore"):
-        if not array.fortran:
-            for block in _blocks(archive, array):
-                wide = block.astype(np.float64)
-                here = slice(at, at + len(wide))
-                lengths[here] = np.sqrt(np.einsum("ij,ij->i", wide, wide))
-                unit[here] = wide / lengths[here, None]
-                at += len(wide)
-            return unit, lengths
-        # Columns come first here, so a row is known whole only after a first pass.
-        for block in _blocks(archive, array):
-            wide = block.astype(np.float64)
-            lengths += np.einsum("ij,ij->j", wide, wide)
-        lengths = np.sqrt(lengths)
-        for block in _blocks(archive, array):
-            wide = block.astype(np.float64)
-            unit[:, at : at + len(wide)] = (wide / lengths).T
-            at += len(wide)
-    return unit, lengths
-
-
-def _header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[np.generic]]:
-    version = np.lib.format.read_magic(stream)
-    if version == (1, 0):
-        return np.lib.format.read_array_header_1_0(stream, max_header_size=_MAX_HEADER)
-    return np.lib.format.read_array_header_2_0(stream, max_header_size=_MAX_HEADER)

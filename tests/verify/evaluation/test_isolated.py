@@ -12,6 +12,7 @@ import scipy.io
 
 from tests.verify.evaluation.layouts import agedb_folder
 from verify.datasets import DatasetError
+from verify.evaluation.embeddings_file import read_embeddings
 from verify.evaluation.readers import isolated as module
 from verify.evaluation.readers import open_sets
 from verify.evaluation.readers.agedb import PROTOCOL
@@ -69,6 +70,19 @@ def test_a_matlab_file_that_unpacks_to_much_is_refused(
     scipy.io.savemat(tmp_path / PROTOCOL, {"splits": np.zeros(2**26)}, do_compression=True)
     with pytest.raises(DatasetError, match="256 MiB"):
         open_sets(tmp_path)
+
+
+def test_an_archive_that_unpacks_to_much_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "MEMORY_BYTES", 2**28)
+    file = tmp_path / "e.npz"
+    np.savez_compressed(file, paths=np.array(["a"]), descriptors=np.zeros((1, 2**27), "f4"))
+    with pytest.raises(DatasetError, match="256 MiB"):
+        read_embeddings(file)
+    rows = np.eye(2, 4)
+    np.savez(file, paths=np.array(["a", "b"]), descriptors=2 * rows)
+    np.testing.assert_array_equal(read_embeddings(file).descriptors, rows)
 
 
 @pytest.mark.parametrize("seed", [*range(4), *(pytest.param(k, marks=LONG) for k in range(4, 40))])
