@@ -57,15 +57,6 @@ def test_bars_are_the_papers_attacker_and_markers_the_strongest() -> None:
         assert {53.0, 50.0} <= set(levels)
 
 
-def test_groups_differ_in_more_than_hue() -> None:
-    figure = attribute_figure(list(rows()))
-    assert figure is not None
-    raw, random, pool, generated, more = (bar.get_hatch() for bar in figure.axes[0].patches)
-    assert len({raw, random, pool, generated}) == 4
-    assert generated == more
-    assert figure.axes[0].patches[0].get_facecolor() == (1.0, 1.0, 1.0, 1.0)
-
-
 def test_no_neighbours_no_figure_and_the_same_bytes_twice(tmp_path: Path) -> None:
     assert attribute_figure([row for row in rows() if row["attacker"] != "knn"]) is None
     figure = attribute_figure(list(rows()))
