@@ -43,6 +43,7 @@ _MOST_LANES = 512
 _EPS, _TINY = np.finfo(np.float32).eps, np.finfo(np.float32).tiny
 _OVERFLOW = np.float32(1e38)
 _ZERO, _ONE, _TWO = np.float32(0), np.float32(1), np.float32(2)
+_TILT = np.float32(0.3)
 # Multiplications by G before a start, and before those of a pair without proof.
 _POWERS, _MORE_POWERS = 12, 48
 _LONG = np.float32(1e18)
@@ -411,10 +412,13 @@ def _advance(
 
 
 @_compiled
-def _start(problem: Array32, g2: Array32, lanes: int, powers: int, v: Array32) -> None:
+def _start(
+    problem: Array32, g2: Array32, lanes: int, powers: int, tilt: np.float32, v: Array32
+) -> None:
     """Write nearly the leading eigenvector of G, with the sign whose F is the larger, to v."""
     m, w, numbers = len(v), np.empty_like(v), np.empty((4, lanes), dtype=np.float32)
-    v[:] = _ONE
+    for r in range(m):
+        v[r] = _ONE + tilt * np.float32((7 * r + 3) % 5 - 2)
     for _ in range(powers):
         _normalise(v, numbers[0])
         _times(problem, v, w, lanes)
@@ -510,10 +514,13 @@ def _finish(
     waiting: Array32, numbers: Array32, places: NDArray[np.int64], count: int, steps: int,
     still: np.float32, longest: np.float32, similarities: Array32,
 ) -> None:  # fmt: skip
-    """Solve problems from both signs of a better start; ``numbers`` are their ‖g‖² and p·q."""
+    """Solve problems from both signs of another start; ``numbers`` are their ‖g‖² and p·q.
+
+    The first start may be orthogonal to the leading eigenvector, so this one is tilted.
+    """
     v, rest = np.empty_like(waiting[0, 1:]), np.empty_like(numbers)
     best = np.full(count, np.float32(-4))
-    _start(waiting, numbers[0], count, _MORE_POWERS, v)
+    _start(waiting, numbers[0], count, _MORE_POWERS, _TILT, v)
     for sign in (_ONE, -_ONE):
         _ascend(
             waiting.copy(), numbers[0].copy(), count, sign * v, np.arange(count), steps, still,
@@ -550,7 +557,7 @@ def _spherical(
             c, h = problem[2, :, at : at + width], problem[3, :, at : at + width]
             _problems(product[first + at // width], m_d, m_e, gram, c, h, g2[at : at + width])
             _reduce(gram, problem, at)
-        _start(problem, g2, lanes, _POWERS, v)
+        _start(problem, g2, lanes, _POWERS, _ZERO, v)
         work[:], best[:] = problem, np.float32(-4)
         _ascend(work, g2.copy(), lanes, v, np.arange(lanes), steps, still, longest, best, lam, mu)
         sound[:], pivot = _ONE, np.ones(lanes, dtype=np.float32)

@@ -159,8 +159,8 @@ def _write(
     try:
         if target.exists() and not target.is_file():
             raise OSError(errno.EINVAL, "it is there and no regular file: name another one")
-        refuse_another_users(path)  # a link of theirs may lead to a file of root's
-        refuse_another_users(target)
+        for each in (path, target, path.parent, target.parent):  # a link of theirs leads anywhere
+            refuse_another_users(each)
         target.parent.mkdir(mode=0o700 if mode == 0o600 else 0o777, parents=True, exist_ok=True)
         descriptor, name = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
         draft = Path(name)

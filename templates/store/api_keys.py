@@ -14,7 +14,7 @@ import hmac
 import logging
 import os
 import uuid
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from enum import StrEnum
@@ -37,6 +37,7 @@ MAX_LABEL = 128
 
 _NOBODYS_HASH = os.urandom(32)
 _USE_IS_NOTED_EVERY = timedelta(minutes=1)
+_NOTE_WAIT_S = 0.1
 _logger = logging.getLogger("veilface.store")
 
 
@@ -140,7 +141,9 @@ class ApiKeys:
         def work(connection: Connection) -> NewApiKey | None:
             had_keys = (
                 sa.select(ApiKeyRow.id).limit(1),
-                sa.select(AuditRow.sequence).where(AuditRow.action == TENANT_ERASE).limit(1),
+                sa.select(AuditRow.sequence)
+                .where(AuditRow.action.in_(("key-create", TENANT_ERASE)))
+                .limit(1),
                 sa.select(AuditHeadRow.id).where(AuditHeadRow.base_sequence > 0),
             )
             if any(connection.execute(query).first() is not None for query in had_keys):
@@ -183,12 +186,16 @@ class ApiKeys:
         query = _KEYS.order_by(ApiKeyRow.created_at, ApiKeyRow.prefix)
         if tenant is not None:
             query = query.where(TenantRow.name == tenant)
-        rows = self._context.database.read(lambda connection: connection.execute(query).all())
-        return tuple(self._read(row) for row in rows)
+        return self._context.database.read(lambda connection: self._read_all(connection, query))
 
     def read_all(self, connection: Connection) -> tuple[ApiKey, ...]:
         """Every key, inside a transaction."""
-        return tuple(self._read(row) for row in connection.execute(_KEYS).all())
+        return self._read_all(connection, _KEYS)
+
+    def _read_all(self, connection: Connection, query: Any) -> tuple[ApiKey, ...]:
+        with _unreadable_is_altered():
+            rows = connection.execute(query).all()
+        return tuple(self._read(row) for row in rows)
 
     def revoke(self, prefix: str, *, by: By = PROGRAM) -> bool:
         """Revoke a key for good; True unless it was unknown or revoked before.
@@ -277,12 +284,15 @@ class ApiKeys:
             return
         statement = sa.update(ApiKeyRow).where(ApiKeyRow.id == key.id).values(last_used_at=now)
         with contextlib.suppress(StoreError):
-            self._context.database.write(lambda connection: connection.execute(statement))
+            self._context.database.write(
+                lambda connection: connection.execute(statement), wait=_NOTE_WAIT_S
+            )
 
     def _row(self, prefix: str) -> Any:
-        return self._context.database.read(
-            lambda connection: connection.execute(_OF_PREFIX, {"prefix": prefix}).one_or_none()
-        )
+        with _unreadable_is_altered():
+            return self._context.database.read(
+                lambda connection: connection.execute(_OF_PREFIX, {"prefix": prefix}).one_or_none()
+            )
 
     def _valid(self, row: Any) -> ApiKey | None:
         if row is None:
@@ -296,9 +306,10 @@ class ApiKeys:
         return key if key.is_valid_at(self._context.clock()) else None
 
     def _read(self, row: Any) -> ApiKey:
-        values = {name: row._mapping[name] for name in _FIELDS}
-        values["rights"] = _granted(row.rights)
-        return ApiKey(**values, authentic=self._is_authentic(row))
+        with _unreadable_is_altered():
+            values = {name: row._mapping[name] for name in _FIELDS}
+            values["rights"] = _granted(row.rights)
+            return ApiKey(**values, authentic=self._is_authentic(row))
 
     def _is_authentic(self, row: Any) -> bool:
         expected = _mac(self._context.secrets.get(SecretName.API_KEYS), row._mapping)
@@ -365,6 +376,17 @@ _KEYS: Any = sa.select(
     TenantRow.name.label("tenant"),
 ).join(TenantRow, TenantRow.id == ApiKeyRow.tenant_id)
 _OF_PREFIX = _KEYS.where(ApiKeyRow.prefix == sa.bindparam("prefix"))
+
+
+@contextlib.contextmanager
+def _unreadable_is_altered() -> Iterator[None]:
+    # SQLite keeps any value in any column.
+    try:
+        yield
+    except (ValueError, TypeError):
+        raise StoreError(
+            "a row of the API keys was altered: run `veilface audit-log verify`"
+        ) from None
 
 
 def _mac(secret: bytes, values: Mapping[str, Any]) -> bytes:

@@ -146,7 +146,7 @@ class Attempts:
 
         def work(connection: Connection) -> bool:
             row = self._standing(connection, tenant, subject_id, None)
-            status = _status(row)
+            status = self._status(row)
             lifts = status is not None and not status.is_clear
             if status is not None and lifts:
                 _write_counts(connection, row, pseudonym, status.cleared())
@@ -163,14 +163,13 @@ class Attempts:
         row = self._context.database.read(
             lambda connection: self._standing(connection, tenant, subject_id, None)
         )
-        return _status(row)
+        return self._status(row)
 
     def expire(self) -> int:
         """Remove the counts of subjects that did not fail for ninety days; returns how many."""
-        due = sa.and_(
-            FailedAttemptsRow.disabled_at.is_(None),
-            FailedAttemptsRow.last_failed_at <= self._context.clock() - COUNT_RETENTION,
-        )
+        due = FailedAttemptsRow.last_failed_at <= self._context.clock() - COUNT_RETENTION
+        if self._policy.after:
+            due &= FailedAttemptsRow.consecutive < self._policy.disable_at
         database = self._context.database
         # Read first: a round that has nothing to remove, and most have not, waits for no write.
         some = sa.select(FailedAttemptsRow.pseudonym).where(due).limit(1)
@@ -193,7 +192,7 @@ class Attempts:
             raise UnknownTenant.of_name(tenant)
         if row.is_used:
             raise Replayed
-        self._policy.refuse_locked(_status(row), self._context.clock())
+        self._policy.refuse_locked(self._status(row), self._context.clock())
         template = None
         if row.template_id is not None:
             template = opened_template(row, self._context.keyring)
@@ -216,7 +215,7 @@ class Attempts:
 
         def work(connection: Connection) -> LockedOut | Replayed | None:
             row, now = self._standing(connection, tenant, subject_id, token), self._context.clock()
-            status, spent = _status(row), token
+            status, spent = self._status(row), token
             refusal: LockedOut | Replayed | None = None
             outcome = "accept" if decided.accepted else "reject"
             try:
@@ -232,7 +231,8 @@ class Attempts:
                 if stored != template_id:
                     raise Superseded
                 if not decided.accepted:
-                    new = self._policy.after_failure(status, now)
+                    failed = (0, 0) if status is None else (status.consecutive, status.total)
+                    new = AttemptsStatus(failed[0] + 1, failed[1] + 1, now, None, None)
                     _write_counts(connection, row, pseudonym, new)
                 else:
                     use = {"of_subject": row.subject_pk, "last_used_at": now}
@@ -257,6 +257,11 @@ class Attempts:
             raise UnknownTenant.of_name(tenant)
         return row
 
+    def _status(self, row: Any) -> AttemptsStatus | None:
+        if row.counted is None:
+            return None
+        return self._policy.status(row.consecutive, row.total, row.last_failed_at)
+
     def _parameters(self, tenant: str, subject_id: str, token: str | None) -> dict[str, Any]:
         pseudonym = self._context.signer.pseudonym(tenant, checked_subject_id(subject_id))
         return {
@@ -268,7 +273,7 @@ class Attempts:
 
 
 # Made once: building a statement costs more than running it.
-_COUNTS = tuple(AttemptsStatus.__dataclass_fields__)
+_COUNTS = ("consecutive", "total", "last_failed_at")
 _COMMON = (
     *(getattr(FailedAttemptsRow, name) for name in _COUNTS),
     FailedAttemptsRow.pseudonym.label("counted"),
@@ -343,16 +348,11 @@ _NEXT_COUNTS = sa.update(_failures).where(
 _NOTE_USE = sa.update(_subjects).where(_subjects.c.id == sa.bindparam("of_subject"))
 
 
-def _status(row: Any) -> AttemptsStatus | None:
-    if row.counted is None:
-        return None
-    return AttemptsStatus(**{name: row._mapping[name] for name in _COUNTS})
-
-
 def _write_counts(connection: Connection, row: Any, pseudonym: str, status: AttemptsStatus) -> None:
+    counts = {name: getattr(status, name) for name in _COUNTS}
     if row.counted is None:
         identity = {"tenant_id": row.tenant_id, "pseudonym": pseudonym}
-        connection.execute(_FIRST_COUNTS, {**identity, **vars(status)})
+        connection.execute(_FIRST_COUNTS, {**identity, **counts})
     else:
         identity = {"of_tenant": row.tenant_id, "of_pseudonym": pseudonym}
-        connection.execute(_NEXT_COUNTS, {**identity, **vars(status)})
+        connection.execute(_NEXT_COUNTS, {**identity, **counts})

@@ -23,7 +23,7 @@ from typing import Any
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
-from templates.errors import StoreError
+from templates.errors import StoreBusy, StoreError
 from templates.keys.sealing import encode_parts
 from templates.store.database import Database
 from templates.store.identifiers import (
@@ -423,13 +423,15 @@ class AuditLog:
             return Verification(0, START, Problem(0, "head does not match"))
         last, count, is_anchored = base, 0, anchor in (None, base)
         while True:
-            # In one query: a line that comes later is not taken for one beyond the head.
+            # The head first: a line that comes between the two reads is not beyond the head.
             head, rows = self._database.read(
                 lambda connection, after=last.sequence: (  # type: ignore[misc]
                     read_head(connection, key),
                     _first_lines(connection, base, after, batch),
                 )
             )
+            if head.base != base:
+                raise StoreBusy("lines were archived meanwhile: verify the log again")
             for row in rows:
                 values = row._mapping
                 if what := line_break(key, values, last):
@@ -521,8 +523,9 @@ def head_columns(head: Head, key: bytes) -> dict[str, Any]:
 
 def _first_lines(connection: Connection, base: Anchor, after: int, batch: int) -> Sequence[Any]:
     # From the very first row: a line that was slipped in before the base must be seen too.
-    after = after if after > base.sequence else -(2**62)
-    query = LINES.where(AuditRow.sequence > after).order_by(AuditRow.sequence).limit(batch)
+    query = LINES.order_by(AuditRow.sequence).limit(batch)
+    if after > base.sequence:
+        query = query.where(AuditRow.sequence > after)
     return connection.execute(query).all()
 
 

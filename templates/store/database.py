@@ -112,8 +112,8 @@ class Database:
         work
             For a short time: every other write waits for it.
         wait
-            Seconds to wait for other writes; the timeout by default, and 0 on PostgreSQL for as
-            long as it takes.
+            Seconds to wait for other writes; the timeout by default, and 0 for as long as it takes
+            (on SQLite the timeout).
 
         Raises
         ------
@@ -123,19 +123,19 @@ class Database:
             As of :meth:`read`. Nothing was written.
         """
         process = self._process()
-        with _translating():
+        longest = self._timeout if wait is None else wait
+        until = time.monotonic() + (longest or self._timeout)
+        # Threads queue here in turn: SQLite's own lock is polled and knows no order, and on
+        # PostgreSQL each that waits would hold a connection that readers need.
+        turn = process.turn_to_write(longest or None)
+        with _translating(), turn, process.engine.begin() as connection:
             if self.is_sqlite:
-                # Threads queue here in turn; SQLite's own lock is polled and knows no order.
-                until = time.monotonic() + self._timeout
-                with process.turn_to_write(), process.engine.begin() as connection:
-                    with self._turn(until), self._patience(connection, until) as driver:
-                        driver.execute("BEGIN IMMEDIATE")
-                    process.require_file()
-                    return work(connection)
-            limit = str(round(1000 * (self._timeout if wait is None else wait)))
-            with process.engine.begin() as connection:
-                connection.execute(_BEGIN_WRITE, {"limit": limit})
-                return work(connection)
+                with self._turn(until), self._patience(connection, until) as driver:
+                    driver.execute("BEGIN IMMEDIATE")
+                process.require_file()
+            else:
+                connection.execute(_BEGIN_WRITE, {"limit": str(round(1000 * longest))})
+            return work(connection)
 
     def purge_log(self) -> bool:
         """Move SQLite's write-ahead log into the database file and empty it.
@@ -242,9 +242,9 @@ class _Process:
         )
 
     @contextlib.contextmanager
-    def turn_to_write(self) -> Iterator[None]:
+    def turn_to_write(self, timeout: float | None = None) -> Iterator[None]:
         """Hold the turn among the threads of this process; StoreBusy where it does not come."""
-        if not self._writing.acquire(timeout=self._timeout):
+        if not self._writing.acquire(timeout=timeout or self._timeout):
             raise StoreBusy("other writes of this process take too long")
         try:
             yield
@@ -327,6 +327,8 @@ def _sqlite_error(cause: sqlite3.Error) -> StoreError:
         return StoreError("a table is missing: run `veilface db upgrade`")
     if code.startswith(("SQLITE_CORRUPT", "SQLITE_NOTADB")):
         return StoreUnavailable("the SQLite file is damaged, or is not a database")
+    if code.startswith("SQLITE_BUSY"):
+        return StoreBusy(f"another write takes too long: {cause}")
     if isinstance(cause, sqlite3.OperationalError):
         # SQLite's own words for a full disk, a lock that was not freed and the like.
         return StoreUnavailable(f"the SQLite database does not answer: {cause}")

@@ -81,6 +81,8 @@ def make_engine(url: URL, *, timeout: float, pool_size: int, max_overflow: int) 
         return sa.create_engine(
             url,
             pool_pre_ping=True,
+            # Each statement of a write must see what was committed before its lock was taken.
+            isolation_level="READ COMMITTED",
             connect_args={
                 "connect_timeout": max(2, round(timeout)),
                 "application_name": "veilface",

@@ -171,7 +171,9 @@ class Erasures:
             tenant=tenant, rotation_epoch=owner.rotation_epoch, erased=erased, erased_at=now
         )
         keep_receipt(connection, name, receipt, now)
-        self._context.audit_log.append(connection, Entry(TENANT_ERASE, "erased", by, tenant))
+        self._context.audit_log.append(
+            connection, Entry(TENANT_ERASE, "erased", by, tenant, detail=owner.id)
+        )
         return receipt, True
 
 

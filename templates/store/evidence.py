@@ -12,15 +12,18 @@ from typing import Any
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
+from templates.errors import StoreError
 from templates.store.api_keys import ApiKey, ApiKeys
 from templates.store.attempts import COUNT_RETENTION
 from templates.store.audit_log import TENANT_ERASE, Anchor, AuditLog, Verification
 from templates.store.context import StoreContext
-from templates.store.schema import FailedAttemptsRow, SubjectRow, TenantRow
+from templates.store.schema import FailedAttemptsRow, SubjectRow, TemplateRow, TenantRow
 
 KEY_ALTERED = "the row of an API key was made up or altered"
 KEY_PUT_BACK = "an API key that was revoked, replaced or erased was put back"
-ENROLLMENT_PUT_BACK = "an enrollment that was erased was put back"
+ENROLLMENT_PUT_BACK = "an enrollment that was erased or replaced was put back"
+TENANT_PUT_BACK = "a tenant that was erased was put back"
+TENANT_ALTERED = "a setting of a tenant was changed"
 COUNT_LIFTED = "a count of failed attempts was lowered or removed"
 
 # Named, because a refused call leaves a line too, with the same action and its error code.
@@ -28,6 +31,8 @@ _REMOVES_COUNT = {("erase", "erased"), ("erase", "nothing_held"), ("erase", "rec
 _ENDS_FAILURES = {("verify", "accept"), ("lockout-reset", "reset")}
 # An hour less: a clock that differs by less than that removed nothing wrongly.
 _FORGOTTEN_AFTER = COUNT_RETENTION - timedelta(hours=1)
+# Row and line take the time one after the other.
+_SAME_WRITE = timedelta(seconds=10)
 
 
 @dataclass(frozen=True)
@@ -52,39 +57,38 @@ class _Told:
 
     ended_keys: set[str] = field(default_factory=set)
     replaced_keys: dict[str, datetime] = field(default_factory=dict)
-    keys_of_tenants: dict[str, set[str]] = field(default_factory=dict)
+    erased_tenants: set[str] = field(default_factory=set)
+    settings: dict[str, bool] = field(default_factory=dict)
     failures: dict[str, _Failures] = field(default_factory=dict)
-    enrolled: dict[str, str] = field(default_factory=dict)
-    erased: set[str] = field(default_factory=set)
+    templates: dict[str, str | None] = field(default_factory=dict)
 
     def read(self, line: Mapping[str, Any]) -> None:
         """Take note of a line."""
         action, outcome, tenant = line["action"], line["outcome"], line["tenant"]
-        if action == "key-create":
-            self.keys_of_tenants.setdefault(tenant, set()).add(line["detail"])
-        elif action == "key-revoke" and outcome == "revoked":
-            self.ended_keys.add(line["detail"])
+        pseudonym, detail = line["pseudonym"], line["detail"]
+        if action == "key-revoke" and outcome == "revoked":
+            self.ended_keys.add(detail)
         elif action == "key-replace":
-            prefix, _, ends = line["detail"].partition(" ")
+            prefix, _, ends = detail.partition(" ")
             if ends:
                 until = datetime.fromisoformat(ends)
                 self.replaced_keys[prefix] = min(until, self.replaced_keys.get(prefix, until))
+        elif action == "tenant-settings":
+            self.settings[tenant] = outcome == "template-enrollment-on"
         elif action == TENANT_ERASE and outcome == "erased":
-            self.ended_keys |= self.keys_of_tenants.pop(tenant, set())
-            self.erased |= {each for each, owner in self.enrolled.items() if owner == tenant}
-            for pseudonym in [p for p, f in self.failures.items() if f.tenant == tenant]:
-                del self.failures[pseudonym]
+            self.erased_tenants.add(detail)
+            self.settings.pop(tenant, None)
+            for each in [p for p, f in self.failures.items() if f.tenant == tenant]:
+                del self.failures[each]
         elif action in ("enroll", "import") and outcome in ("created", "replaced"):
-            self.enrolled[line["pseudonym"]] = tenant
-            self.erased.discard(line["pseudonym"])
+            self.templates[pseudonym] = detail
         elif (action, outcome) in _REMOVES_COUNT:
-            self.failures.pop(line["pseudonym"], None)
-            if self.enrolled.pop(line["pseudonym"], None):
-                self.erased.add(line["pseudonym"])
+            self.failures.pop(pseudonym, None)
+            self.templates[pseudonym] = None
         elif action == "verify" and outcome == "reject":
-            self._count(line["pseudonym"], tenant, datetime.fromisoformat(line["at"]))
-        elif (action, outcome) in _ENDS_FAILURES and line["pseudonym"] in self.failures:
-            self.failures[line["pseudonym"]].consecutive = 0
+            self._count(pseudonym, tenant, datetime.fromisoformat(line["at"]))
+        elif (action, outcome) in _ENDS_FAILURES and pseudonym in self.failures:
+            self.failures[pseudonym].consecutive = 0
 
     def _count(self, pseudonym: str, tenant: str, at: datetime) -> None:
         failures = self.failures.setdefault(pseudonym, _Failures(tenant, at))
@@ -102,7 +106,7 @@ def verify_log_and_records(
     anchor: Anchor | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> tuple[Verification, tuple[RecordProblem, ...]]:
-    """Walk over the audit log, and hold keys, enrollments and counts against it.
+    """Walk over the audit log, and hold rows against what it tells.
 
     Parameters
     ----------
@@ -126,6 +130,7 @@ def verify_log_and_records(
             told.read(line)
         return (
             *_keys(told, api_keys, connection),
+            *_tenants(told, connection),
             *_enrollments(told, context, connection),
             *_counts(told, context, connection),
         )
@@ -134,12 +139,27 @@ def verify_log_and_records(
 
 
 def _keys(told: _Told, api_keys: ApiKeys, connection: Connection) -> list[RecordProblem]:
+    try:
+        keys = api_keys.read_all(connection)
+    except StoreError:
+        return [RecordProblem(KEY_ALTERED, "a row that cannot be read")]
     problems = []
-    for key in api_keys.read_all(connection):
+    for key in keys:
         if not key.authentic:
             problems.append(RecordProblem(KEY_ALTERED, f"key:{key.prefix}"))
         elif _is_back(told, key):
             problems.append(RecordProblem(KEY_PUT_BACK, f"key:{key.prefix}"))
+    return problems
+
+
+def _tenants(told: _Told, connection: Connection) -> list[RecordProblem]:
+    columns = TenantRow.id, TenantRow.name, TenantRow.template_enrollment
+    problems = []
+    for tenant_id, name, template_enrollment in connection.execute(sa.select(*columns)):
+        if tenant_id in told.erased_tenants:
+            problems.append(RecordProblem(TENANT_PUT_BACK, name))
+        elif told.settings.get(name, template_enrollment) != template_enrollment:
+            problems.append(RecordProblem(TENANT_ALTERED, name))
     return problems
 
 
@@ -151,11 +171,17 @@ def _is_back(told: _Told, key: ApiKey) -> bool:
 
 
 def _enrollments(told: _Told, context: StoreContext, connection: Connection) -> list[RecordProblem]:
-    query = sa.select(TenantRow.name, SubjectRow.subject_id).join(
-        TenantRow, TenantRow.id == SubjectRow.tenant_id
+    query = (
+        sa.select(TenantRow.name, SubjectRow.subject_id, TemplateRow.template_id)
+        .join(SubjectRow, SubjectRow.tenant_id == TenantRow.id)
+        .join(TemplateRow, TemplateRow.subject_pk == SubjectRow.id)
     )
-    pseudonyms = (context.signer.pseudonym(*row) for row in connection.execute(query))
-    return [RecordProblem(ENROLLMENT_PUT_BACK, each) for each in pseudonyms if each in told.erased]
+    problems = []
+    for tenant, subject_id, template_id in connection.execute(query):
+        pseudonym = context.signer.pseudonym(tenant, subject_id)
+        if told.templates.get(pseudonym, template_id) != template_id:
+            problems.append(RecordProblem(ENROLLMENT_PUT_BACK, pseudonym))
+    return problems
 
 
 def _counts(told: _Told, context: StoreContext, connection: Connection) -> list[RecordProblem]:
@@ -163,17 +189,22 @@ def _counts(told: _Told, context: StoreContext, connection: Connection) -> list[
         FailedAttemptsRow.pseudonym,
         FailedAttemptsRow.consecutive,
         FailedAttemptsRow.total,
+        FailedAttemptsRow.last_failed_at,
     )
-    rows = connection.execute(sa.select(*columns))
-    stored = {row.pseudonym: (row.consecutive, row.total) for row in rows}
+    stored = {row.pseudonym: row for row in connection.execute(sa.select(*columns))}
     return [
         RecordProblem(COUNT_LIFTED, pseudonym)
         for pseudonym, failures in told.failures.items()
         if failures.last_at > context.clock() - _FORGOTTEN_AFTER
-        and _is_lower(stored.get(pseudonym, (0, 0)), failures)
+        and not _holds(stored.get(pseudonym), failures)
     ]
 
 
-def _is_lower(stored: tuple[int, int], failures: _Failures) -> bool:
-    consecutive, total = stored
-    return consecutive < failures.consecutive or total < failures.total
+def _holds(row: Any, failures: _Failures) -> bool:
+    """Whether a row counts what the log tells, and its last failure is the log's."""
+    return (
+        row is not None
+        and row.consecutive >= failures.consecutive
+        and row.total >= failures.total
+        and abs(row.last_failed_at - failures.last_at) < _SAME_WRITE
+    )

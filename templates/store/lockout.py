@@ -60,23 +60,21 @@ class LockoutPolicy:
         if self.after and self.disable_at < self.after:
             raise StoreError("a subject is disabled after no fewer failures than lock it")
 
-    def after_failure(self, status: AttemptsStatus | None, now: datetime) -> AttemptsStatus:
-        """Status of a subject that has just failed once more."""
-        consecutive, total = (0, 0) if status is None else (status.consecutive, status.total)
-        consecutive, total = consecutive + 1, total + 1
+    def status(self, consecutive: int, total: int, last_failed_at: datetime) -> AttemptsStatus:
+        """Status of a subject with so many failures: the lock follows from the counts."""
         locked_until = disabled_at = None
         if self.after and consecutive >= self.after:
             doublings = min(consecutive - self.after, _MAX_DOUBLINGS)
             seconds = min(self.first_s * 2.0**doublings, self.longest_s)
-            locked_until = now + timedelta(seconds=seconds)
-            disabled_at = now if consecutive >= self.disable_at else None
-        return AttemptsStatus(consecutive, total, now, locked_until, disabled_at)
+            locked_until = last_failed_at + timedelta(seconds=seconds)
+            disabled_at = last_failed_at if consecutive >= self.disable_at else None
+        return AttemptsStatus(consecutive, total, last_failed_at, locked_until, disabled_at)
 
     def refuse_locked(self, status: AttemptsStatus | None, now: datetime) -> None:
         """Raise :class:`LockedOut` where the subject is locked now.
 
-        A lock that began later than now, by more than its own length, does not hold: the clock was
-        set back, and the lock would last until the earlier time comes again.
+        A lock that seems to begin in the future, by more than its own length, is ignored: the
+        clock was set back, and the lock would last until that time comes again.
         """
         if not self.after or status is None:
             return

@@ -39,7 +39,14 @@ from templates.store.tenants import Tenants
 _LOCKOUT = LockoutPolicy()
 _TRIAL_NAME = "trial-write"
 _TRIAL_BYTES = 128 * 1024
-_HOLD_SUBJECT_DATA = (SubjectRow, TemplateRow, FailedAttemptsRow, RotationKeyRow, ApiKeyRow)
+_HOLD_SUBJECT_DATA = (
+    SubjectRow,
+    TemplateRow,
+    FailedAttemptsRow,
+    RotationKeyRow,
+    ApiKeyRow,
+    SecretRow,
+)
 
 
 class TemplateStore:
@@ -90,11 +97,12 @@ class TemplateStore:
 
     def _set_up(self, connection: Connection) -> None:
         made = self.secrets.make_missing(connection)
-        if SecretName.CHAIN not in made:
+        if not made:
             return
         if connection.execute(sa.select(AuditHeadRow.id)).first() is not None:
             raise BrokenAuditLog(
-                "the secret of the audit log is missing: restore the database from a backup"
+                f"secrets of the deployment are missing ({', '.join(sorted(made))}): "
+                "restore the database from a backup"
             )
         query = sa.select(SecretRow.wrapped_value).where(SecretRow.name == SecretName.CHAIN)
         sealed = connection.execute(query).scalar_one()

@@ -13,6 +13,7 @@ import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 from sqlalchemy.orm import InstrumentedAttribute
 
+from templates.errors import SealError
 from templates.keys.sealing import sealed_key_id
 from templates.store.context import StoreContext
 from templates.store.envelope import DATA_KEY_PURPOSE
@@ -83,22 +84,30 @@ class WrappedKeys:
         Raises
         ------
         SealError
-            If a blob is under a key that the keyring lacks. What was wrapped again before it stays
-            so, and the next run goes on from there.
+            At the end, if blobs were altered or are under a key that the keyring lacks. All others
+            are wrapped again.
         """
-        database, keyring, total, current = self._context.database, self._context.keyring, 0, None
+        database, keyring, current = self._context.database, self._context.keyring, None
+        total = broken = 0
         while keyring.current != current:  # again where the key file changed once more meanwhile
             current = keyring.current
             for column in WRAPPED_COLUMNS:
-                while count := database.write(
-                    lambda connection, column=column: self._rewrap(  # type: ignore[misc]
-                        connection, column, batch
+                after: tuple[Any, ...] | None = ()
+                while after is not None:
+                    changed, failed, after = database.write(
+                        lambda connection, column=column, after=after: (  # type: ignore[misc]
+                            self._rewrap(connection, column, after, batch)
+                        )
                     )
-                ):
-                    total += count
-                    if progress is not None:
-                        progress(count)
+                    total, broken = total + changed, broken + failed
+                    if progress is not None and changed:
+                        progress(changed)
         database.purge_log()
+        if broken:
+            raise SealError(
+                f"{broken} blobs do not open: their rows were altered, or a master key is missing. "
+                "Put the key back and run it again, or enroll these subjects again, or erase them"
+            )
         return total
 
     def count(self) -> dict[str, int]:
@@ -115,22 +124,33 @@ class WrappedKeys:
 
         return self._context.database.read(work)
 
-    def _rewrap(self, connection: Connection, column: WrappedColumn, batch: int) -> int:
+    def _rewrap(
+        self, connection: Connection, column: WrappedColumn, after: tuple[Any, ...], batch: int
+    ) -> tuple[int, int, tuple[Any, ...] | None]:
+        """Wrap the next rows again; returns how many, how many do not open, and the last key."""
         keyring = self._context.keyring
         columns = dict.fromkeys((*column.key, *column.bound_to))
-        rows = connection.execute(
+        query: Any = (
             sa.select(column.blob.label("blob"), *columns)
             .where(column.wrapping_key != keyring.current)
             .order_by(*column.key)
             .limit(batch)
-        ).all()
+        )
+        if after:
+            query = query.where(sa.tuple_(*column.key) > sa.tuple_(*map(sa.literal, after)))
+        rows, broken, last = connection.execute(query).all(), 0, None
         for row in rows:
             bound_to = [row._mapping[part.key] for part in column.bound_to]
-            new = keyring.rewrap(row.blob, purpose=column.purpose, bound_to=bound_to)
-            is_row = (part == row._mapping[part.key] for part in column.key)
+            last = tuple(row._mapping[part.key] for part in column.key)
+            try:
+                new = keyring.rewrap(row.blob, purpose=column.purpose, bound_to=bound_to)
+            except SealError:
+                broken += 1
+                continue
+            is_row = sa.tuple_(*column.key) == sa.tuple_(*map(sa.literal, last))
             connection.execute(
                 sa.update(column.table)
-                .where(*is_row)
+                .where(is_row)
                 .values({column.blob: new, column.wrapping_key: sealed_key_id(new)})
             )
-        return len(rows)
+        return len(rows) - broken, broken, last

@@ -169,7 +169,7 @@ class TemplateRow(Base):
 
 
 class FailedAttemptsRow(Base):
-    """Failed verifications of a subject, enrolled or not, and until when it is locked."""
+    """Failed verifications of a subject, enrolled or not; its lock follows from them."""
 
     __tablename__ = "failed_attempts"
 
@@ -180,8 +180,6 @@ class FailedAttemptsRow(Base):
     consecutive: Mapped[int] = mapped_column(Integer)
     total: Mapped[int] = mapped_column(Integer)
     last_failed_at: Mapped[datetime] = mapped_column(UtcDateTime, index=True)
-    locked_until: Mapped[datetime | None] = mapped_column(UtcDateTime)
-    disabled_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
 
 
 class ReceiptRow(Base):

@@ -190,7 +190,7 @@ class Subjects:
             now = context.clock()
             _write_rows(connection, owner, envelope, metadata, is_new=is_new, now=now)
             outcome = "created" if is_new else "replaced"
-            entry = Entry(action, outcome, by, tenant, pseudonym, token=token)
+            entry = Entry(action, outcome, by, tenant, pseudonym, template_id, token)
             context.audit_log.append(connection, entry)
             return StoredTemplate(template_id, is_new)
 

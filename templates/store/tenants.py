@@ -14,6 +14,7 @@ from typing import Any
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
+from templates.errors import StoreError
 from templates.keys.sealing import sealed_key_id
 from templates.store.audit_log import PROGRAM, By, Entry
 from templates.store.context import StoreContext
@@ -164,7 +165,10 @@ class Tenants:
         receipt = latest_receipt(connection, tenant_receipt_name(name))
         if receipt is None:
             return 0
-        return int(verify_receipt(receipt, self._context.signer.public_key())["rotation_epoch"])
+        claims = verify_receipt(receipt, self._context.signer.public_key())
+        if claims.get("tenant") != name or "rotation_epoch" not in claims:
+            raise StoreError("the receipt of this tenant's erasure was put in another's place")
+        return int(claims["rotation_epoch"])
 
 
 def tenant_of(connection: Connection, name: str) -> Tenant:

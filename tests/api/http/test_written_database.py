@@ -202,7 +202,7 @@ def undo_replacement(attacked: Attacked) -> str:
     return KEY_PUT_BACK
 
 
-END_LOCK = "UPDATE failed_attempts SET consecutive = 0, locked_until = NULL"
+END_LOCK = "UPDATE failed_attempts SET consecutive = 0"
 
 
 def lift(statement: str, face: int) -> Callable[[Attacked], str]:

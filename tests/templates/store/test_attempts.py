@@ -232,7 +232,7 @@ def test_a_policy_that_makes_no_sense_is_refused(change: dict[str, Any]) -> None
 
 def test_a_long_row_of_failures_does_not_overflow(clock: Clock) -> None:
     many = AttemptsStatus(10**8, 10**8, clock.time, None, None)
-    locked = LockoutPolicy(disable_at=10**9).after_failure(many, clock.time)
+    locked = LockoutPolicy(disable_at=10**9).status(many.consecutive, many.total, clock.time)
     assert locked.locked_until == clock.time + timedelta(hours=1)
 
 

@@ -226,8 +226,8 @@ def test_another_master_key_does_not_verify(
 
 def test_every_write_has_its_line(store: TemplateStore) -> None:
     by = By("operator:root", "request-12345678")
-    put(store, "ada", b"one", by=by)
-    put(store, "ada", b"two", by=by, token=TOKEN)
+    one = put(store, "ada", b"one", by=by)
+    two = put(store, "ada", b"two", by=by, token=TOKEN)
     store.erasures.erase("default", "ada", by=by)
     store.erasures.erase("default", "ada", by=by)
     store.erasures.erase("default", "eve", by=by)
@@ -241,8 +241,8 @@ def test_every_write_has_its_line(store: TemplateStore) -> None:
         (line.action, line.outcome, line.tenant, line.pseudonym, line.detail, line.token)
         for line in lines
     ] == [
-        ("enroll", "created", "default", ada, None, None),
-        ("enroll", "replaced", "default", ada, None, TOKEN),
+        ("enroll", "created", "default", ada, one.template_id, None),
+        ("enroll", "replaced", "default", ada, two.template_id, TOKEN),
         ("erase", "erased", "default", ada, None, None),
         ("erase", "receipt_repeated", "default", ada, None, None),
         ("erase", "nothing_held", "default", eve, None, None),
@@ -343,6 +343,7 @@ TAMPERING = {
     "a line beyond the head": ([COPY.format(9)], 9),
     "a line far beyond the head": ([COPY.format(2**62)], 9),
     "a line before the first": ([COPY.format(-3)], -3),
+    "a line before all numbers": ([COPY.format(-(2**63))], -(2**63)),
 }
 
 
@@ -412,15 +413,20 @@ def test_a_log_that_was_put_back_is_found_with_an_anchor_only(
     assert problem(filled, late) == (9, "anchor not in chain")
 
 
-def test_the_secret_of_a_log_that_began_is_not_made_anew(
-    filled: TemplateStore, attacker: Callable[..., None], database_url: str, keyring: MasterKeyring
+@pytest.mark.parametrize("name", SecretName)
+def test_no_secret_is_made_anew_once_the_log_began(
+    filled: TemplateStore,
+    attacker: Callable[..., None],
+    database_url: str,
+    keyring: MasterKeyring,
+    name: SecretName,
 ) -> None:
-    attacker("DELETE FROM secrets WHERE name = 'audit-chain'")
+    attacker(f"DELETE FROM secrets WHERE name = '{name}'")
     fresh = TemplateStore(database_url, keyring)
-    with pytest.raises(BrokenAuditLog, match="backup"):
+    with pytest.raises(BrokenAuditLog, match=f"{name}.* backup"):
         fresh.upgrade()
     with pytest.raises(StoreError, match="no secret"):
-        fresh.audit_log.verify()
+        fresh.secrets.get(name)
     fresh.close()
 
 

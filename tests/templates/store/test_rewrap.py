@@ -76,7 +76,7 @@ def test_dropping_the_old_key_too_early_fails_at_the_start(
     early = TemplateStore(database_url, MasterKeyring.load(key_file))
     with pytest.raises(SealError, match="not the master key"):
         early.check()
-    with pytest.raises(SealError, match="put the missing key back"):
+    with pytest.raises(SealError, match="Put the key back"):
         early.wrapped_keys.rewrap()
     key_file.write_bytes(backup)
     late = TemplateStore(database_url, MasterKeyring.load(key_file))

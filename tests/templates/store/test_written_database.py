@@ -11,12 +11,15 @@ import pytest
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
+from templates.errors import StoreError
 from templates.store import TemplateStore
 from templates.store.evidence import (
     COUNT_LIFTED,
     ENROLLMENT_PUT_BACK,
     KEY_ALTERED,
     KEY_PUT_BACK,
+    TENANT_ALTERED,
+    TENANT_PUT_BACK,
 )
 from tests.templates.store.conftest import Clock, put
 from tests.templates.store.test_attempts import attempt
@@ -117,7 +120,8 @@ def test_a_key_of_an_erased_tenant_that_was_put_back_is_reported(store: Template
         "INSERT INTO tenants SELECT * FROM kept WHERE name = 'other'",
         "INSERT INTO api_keys SELECT * FROM keys_kept",
     )
-    assert reported(store) == [(KEY_PUT_BACK, f"key:{made.key.prefix}")]
+    assert store.api_keys.verify(made.token) is not None
+    assert reported(store) == [(TENANT_PUT_BACK, "other")]
 
 
 @pytest.mark.parametrize("whole_tenant", [True, False])
@@ -141,8 +145,47 @@ def test_an_erased_enrollment_that_was_put_back_is_reported(
         "INSERT INTO templates SELECT templates_kept.* FROM templates_kept "
         "JOIN subjects_kept ON subject_pk = id WHERE subject_id = 'ada'",
     )
-    ada = store.signer.pseudonym("other", "ada")
-    assert reported(store) == [(ENROLLMENT_PUT_BACK, ada)]
+    ada = (ENROLLMENT_PUT_BACK, store.signer.pseudonym("other", "ada"))
+    assert reported(store) == ([(TENANT_PUT_BACK, "other")] if whole_tenant else [ada])
+
+
+def test_a_replaced_enrollment_that_was_put_back_is_reported(
+    store: TemplateStore, tmp_path: Path
+) -> None:
+    put(store, "ada", b"one")
+    store.archive_audit_log(tmp_path / "before.jsonl", through=None)
+    tables = ("subjects", "templates")
+    write(store, *(f"CREATE TABLE {table}_kept AS SELECT * FROM {table}" for table in tables))
+    put(store, "ada", b"two")
+    assert reported(store) == []
+    write(
+        store,
+        "DELETE FROM subjects",
+        *(f"INSERT INTO {table} SELECT * FROM {table}_kept" for table in tables),
+    )
+    ada = [(ENROLLMENT_PUT_BACK, store.signer.pseudonym("default", "ada"))]
+    assert reported(store) == ada
+    store.erasures.erase("default", "ada")
+    assert reported(store) == []
+    write(store, *(f"INSERT INTO {table} SELECT * FROM {table}_kept" for table in tables))
+    assert reported(store) == ada
+
+
+def test_a_setting_of_a_tenant_that_was_changed_is_reported(store: TemplateStore) -> None:
+    store.tenants.set_template_enrollment("default", False)
+    assert reported(store) == []
+    write(store, "UPDATE tenants SET template_enrollment = NOT template_enrollment")
+    assert reported(store) == [(TENANT_ALTERED, "default")]
+
+
+@pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
+@pytest.mark.parametrize("change", ["expires_at = 'x'", "mac = 'text'", "rights = x'00'"])
+def test_a_key_row_that_cannot_be_read_is_reported(store: TemplateStore, change: str) -> None:
+    made = store.api_keys.create("default", ["verify"])
+    write(store, f"UPDATE api_keys SET {change}")
+    with pytest.raises(StoreError, match="was altered"):
+        store.api_keys.verify(made.token)
+    assert reported(store) == [(KEY_ALTERED, "a row that cannot be read")]
 
 
 @pytest.mark.parametrize("enrolled", [True, False])
@@ -153,11 +196,19 @@ def test_a_lock_that_was_lifted_is_reported(store: TemplateStore, enrolled: bool
         attempt(store)
     assert attempt(store) == "locked 30"
     assert reported(store) == []
-    write(store, "UPDATE failed_attempts SET consecutive = 4, locked_until = NULL")
+    lifted = [(COUNT_LIFTED, store.signer.pseudonym("default", "ada"))]
+    for change in (
+        "UPDATE failed_attempts SET last_failed_at = '2027-01-01 00:00:00+00'",
+        "UPDATE failed_attempts SET last_failed_at = '2026-01-01 00:00:00+00'",
+        "UPDATE failed_attempts SET consecutive = 4, total = 4",
+        "DELETE FROM failed_attempts",
+    ):
+        if "SET last" in change and store.database.is_sqlite:
+            change = change.replace("+00'", ".000000'")
+        write(store, change)
+        assert reported(store) == lifted, change
     assert attempt(store) == "reject"
-    assert reported(store) == [(COUNT_LIFTED, store.signer.pseudonym("default", "ada"))]
-    write(store, "DELETE FROM failed_attempts")
-    assert reported(store) == [(COUNT_LIFTED, store.signer.pseudonym("default", "ada"))]
+    assert reported(store) == lifted
 
 
 def test_what_ends_a_count_rightly_is_not_reported(store: TemplateStore, clock: Clock) -> None:

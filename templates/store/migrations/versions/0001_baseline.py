@@ -113,8 +113,6 @@ def upgrade() -> None:
         _column("consecutive", sa.Integer()),
         _column("total", sa.Integer()),
         _column("last_failed_at", _TIME),
-        _column("locked_until", _TIME, nullable=True),
-        _column("disabled_at", _TIME, nullable=True),
         _owned_by("failed_attempts", "tenant_id", "tenants"),
         key=("tenant_id", "pseudonym"),
     )
