@@ -195,7 +195,7 @@ class Contract(JsonValue):
             Photos that the probe is the mean of. The calibration of the most photos that are not
             more serves: a mean of more photos is rejected less often.
         level
-            Of those that have this level only, where one has it.
+            Prefer calibrations with this level, if any has it.
 
         Raises
         ------

@@ -67,7 +67,7 @@ class Nobody:
     strategy, m
         Of the contract; hybrid+ and the sub-strategies are taken in their plain forms.
     cohort_seed
-        32 bytes that the cohort is lifted from. Secret: who has it knows the cohort.
+        32 bytes that the cohort is lifted from. Secret: it gives the cohort.
     """
 
     generator: DecoyGenerator

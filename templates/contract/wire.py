@@ -157,8 +157,8 @@ def _numbers(
         _refuse(f"dimensions out of range: 2 <= n <= {max_n}, 1 <= m <= {max_m}, m < n")
     if not isinstance(contract_id, str) or not _CONTRACT_ID.fullmatch(contract_id):
         _refuse("the contract id is malformed")
-    # There are two headers that say this, but for the order of members: foot or basis first. The
-    # text is compared, because true and 1.0 are 1.
+    # Two headers say this: with the foot first, and with the basis first. The text is compared,
+    # because true and 1.0 are 1.
     said = json.dumps(given, sort_keys=True)
     for foot_first in (True, False):
         fields = _fields(n, m, dtype, contract_id, foot_first=foot_first)

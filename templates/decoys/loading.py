@@ -40,5 +40,5 @@ def client_source(source: DecoySource) -> DecoyGenerator:
     if isinstance(source, DecoyPool):
         return source.fitted
     if not isinstance(source, DecoyGenerator):
-        raise DecoyError("clients lift with a decoy generator, and this source is none")
+        raise DecoyError("clients lift with a decoy generator, and this source is another kind")
     return source

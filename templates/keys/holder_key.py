@@ -31,7 +31,7 @@ def decode_holder_key(text: object) -> bytearray:
     Raises
     ------
     SealError
-        If it is none; the message does not repeat it.
+        If it is no holder key; the message does not repeat it.
     """
     if not isinstance(text, str) or not _KEY.fullmatch(text):
         raise SealError("a holder key is 32 bytes in base64url: 43 characters, and = or nothing")

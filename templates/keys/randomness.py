@@ -1,8 +1,7 @@
 """Random samples from a ChaCha20 keystream.
 
-The generator is a cryptographic one (docs/method.md §2.3): who sees a template (which is public to
-whoever steals it) must not be able to predict the randomness of the next one, as they could with
-PCG64 or the Mersenne Twister.
+The generator is a cryptographic one (docs/method.md §2.3): a thief who sees a template must not
+be able to predict the randomness of the next one, as they could with PCG64 or the Mersenne Twister.
 """
 
 import hashlib

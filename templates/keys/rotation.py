@@ -94,8 +94,8 @@ class TenantRotation:
         Notes
         -----
         HKDF-SHA-256 turns the key, n and the id into the bits of all signs. The derived bits are
-        the whole secret of this rotation, so who finds the rotation of their own template out has
-        nothing of another's.
+        the whole secret of this rotation: a person who finds out the rotation of their own template
+        learns nothing about another's.
         """
         info = encode_parts("template rotation", ROTATION_VERSION, self.n, template_id)
         return _derived(self._key, info, self.n)

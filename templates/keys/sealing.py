@@ -44,7 +44,7 @@ _MAX_PLAINTEXT_BYTES = 2**31 - 1 - OVERHEAD_BYTES  # the limit of one call of th
 
 
 class Sealer(Protocol):
-    """Turns bytes into sealed bytes and back; whoever lacks the key learns only the length."""
+    """Turns bytes into sealed bytes and back; without the key, only the length shows."""
 
     def seal(self, plaintext: bytes, *, context: str) -> bytes:
         """Encrypt `plaintext` so that it opens only with the same `context`."""

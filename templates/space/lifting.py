@@ -94,7 +94,7 @@ def lift_stream(
     Parameters
     ----------
     secret : bytes
-        32 random bytes of the deployment. Who has them and these very pixels has the decoys.
+        32 random bytes of the deployment. With these very pixels they give the decoys.
     contract_id : str
         Of the contract that the template will carry.
     photos : sequence of bytes

@@ -4,7 +4,7 @@ A token is ``vf_<prefix>_<secret>``, 48 and 256 random bits in hexadecimal. The 
 prefix, to find the row, and the SHA-256 of the whole token: a secret of 256 random bits cannot be
 guessed from a fast hash. A row carries an HMAC, under a secret of the deployment, over everything
 that gives rights: so an attacker who can write the database, but has no master key, can neither
-make a key nor widen one. A row whose MAC is wrong is as good as none.
+make a key nor widen one. A row whose MAC is wrong is refused.
 """
 
 import contextlib
@@ -62,7 +62,7 @@ class ApiKey:
     lowest_level
         Security level below which it does not verify; None for any.
     authentic
-        Whether the MAC of its row is good. Else it is as good as none.
+        Whether the MAC of its row is good. Otherwise it is refused.
     """
 
     id: str

@@ -5,9 +5,9 @@ write, before anybody is told of it: its token is used up, the lock is checked, 
 counted, the audit log gets its line. If the template is another one by then, all of it is done
 again.
 
-Counts belong to the subject, never to an API key, and to a subject that is not enrolled just as to
-one that is: neither a second key nor the lock itself tells more, or allows more. They live in the
-database only, so that every worker counts the same and a restart forgets nothing.
+Counts belong to the subject, enrolled or not. A second API key therefore gives no further attempts,
+and a lock does not show whether the subject is enrolled. They live in the database only, so that
+every worker counts the same and a restart forgets nothing.
 """
 
 import contextlib
@@ -112,7 +112,7 @@ class Attempts:
             replaced meanwhile. It may raise :class:`RetiredRotation` for the same reason; what
             else it raises is raised, and then nothing is written.
         contract_id
-            A template of another contract is as good as none, and costs the same.
+            A template of another contract is treated as absent, and costs the same.
         token
             Digest of the one-use token or challenge that the decision uses up.
         by
@@ -186,7 +186,7 @@ class Attempts:
         parameters = self._parameters(tenant, subject_id, token)
         parameters |= {"contract_id": contract_id, "place": parameters["pseudonym"][:32]}
         row = self._context.database.read(
-            lambda connection: connection.execute(BEFORE, parameters).one_or_none()
+            lambda connection: connection.execute(DECISION_QUERY, parameters).one_or_none()
         )
         if row is None:
             raise UnknownTenant.of_name(tenant)
@@ -250,9 +250,9 @@ class Attempts:
     def _standing(
         self, connection: Connection, tenant: str, subject_id: str, token: str | None
     ) -> Any:
-        """Row of :data:`_STANDING`; :class:`UnknownTenant` where there is none."""
+        """Row of :data:`RECORD_QUERY`; :class:`UnknownTenant` where there is none."""
         parameters = self._parameters(tenant, subject_id, token)
-        row = connection.execute(_STANDING, parameters).one_or_none()
+        row = connection.execute(RECORD_QUERY, parameters).one_or_none()
         if row is None:
             raise UnknownTenant.of_name(tenant)
         return row
@@ -304,7 +304,7 @@ _STAND_IN = sa.func.coalesce(
 """The ciphertext of another subject, always the same one, which nobody opens: a template's bytes
 take a time that would tell who is enrolled."""
 
-BEFORE: Any = (
+DECISION_QUERY: Any = (
     sa.select(
         *TEMPLATE_COLUMNS,
         sa.case((TemplateRow.ciphertext.is_(None), _STAND_IN)).label("stand_in"),
@@ -322,7 +322,7 @@ BEFORE: Any = (
 """What a decision reads, in one row where there is the tenant; the columns of the template are NULL
 where the subject has none of the contract."""
 
-_STANDING: Any = (
+RECORD_QUERY: Any = (
     sa.select(
         TenantRow.id.label("tenant_id"),
         SubjectRow.id.label("subject_pk"),

@@ -29,7 +29,7 @@ COUNT_LIFTED = "a count of failed attempts was lowered or removed"
 # Named, because a refused call leaves a line too, with the same action and its error code.
 _REMOVES_COUNT = {("erase", "erased"), ("erase", "nothing_held"), ("erase", "receipt_repeated")}
 _ENDS_FAILURES = {("verify", "accept"), ("lockout-reset", "reset")}
-# An hour less: a clock that differs by less than that removed nothing wrongly.
+# An hour of slack for clocks that differ.
 _FORGOTTEN_AFTER = COUNT_RETENTION - timedelta(hours=1)
 # Row and line take the time one after the other.
 _SAME_WRITE = timedelta(seconds=10)
@@ -52,7 +52,7 @@ class _Failures:
 
 
 @dataclass
-class _Told:
+class LogFindings:
     """What the lines of the log tell, up to the last one that was read."""
 
     ended_keys: set[str] = field(default_factory=set)
@@ -118,27 +118,27 @@ def verify_log_and_records(
     The walk, and the rows that contradict it. Rows are looked at only where the log is whole. What
     lines in an archive tell is not known.
     """
-    told = _Told()
+    findings = LogFindings()
     log: AuditLog = context.audit_log
-    verification = log.verify(anchor=anchor, seen=told.read, progress=progress)
+    verification = log.verify(anchor=anchor, seen=findings.read, progress=progress)
     if not verification.intact:
         return verification, ()
 
     def work(connection: Connection) -> tuple[RecordProblem, ...]:
         # No other write runs now, so no line is younger than a row.
         for line in log.lines_after(connection, verification.head):
-            told.read(line)
+            findings.read(line)
         return (
-            *_keys(told, api_keys, connection),
-            *_tenants(told, connection),
-            *_enrollments(told, context, connection),
-            *_counts(told, context, connection),
+            *_keys(findings, api_keys, connection),
+            *_tenants(findings, connection),
+            *_enrollments(findings, context, connection),
+            *_counts(findings, context, connection),
         )
 
     return verification, context.database.write(work)
 
 
-def _keys(told: _Told, api_keys: ApiKeys, connection: Connection) -> list[RecordProblem]:
+def _keys(findings: LogFindings, api_keys: ApiKeys, connection: Connection) -> list[RecordProblem]:
     try:
         keys = api_keys.read_all(connection)
     except StoreError:
@@ -147,30 +147,32 @@ def _keys(told: _Told, api_keys: ApiKeys, connection: Connection) -> list[Record
     for key in keys:
         if not key.authentic:
             problems.append(RecordProblem(KEY_ALTERED, f"key:{key.prefix}"))
-        elif _is_back(told, key):
+        elif _is_back(findings, key):
             problems.append(RecordProblem(KEY_PUT_BACK, f"key:{key.prefix}"))
     return problems
 
 
-def _tenants(told: _Told, connection: Connection) -> list[RecordProblem]:
+def _tenants(findings: LogFindings, connection: Connection) -> list[RecordProblem]:
     columns = TenantRow.id, TenantRow.name, TenantRow.template_enrollment
     problems = []
     for tenant_id, name, template_enrollment in connection.execute(sa.select(*columns)):
-        if tenant_id in told.erased_tenants:
+        if tenant_id in findings.erased_tenants:
             problems.append(RecordProblem(TENANT_PUT_BACK, name))
-        elif told.settings.get(name, template_enrollment) != template_enrollment:
+        elif findings.settings.get(name, template_enrollment) != template_enrollment:
             problems.append(RecordProblem(TENANT_ALTERED, name))
     return problems
 
 
-def _is_back(told: _Told, key: ApiKey) -> bool:
-    if key.prefix in told.ended_keys and key.revoked_at is None:
+def _is_back(findings: LogFindings, key: ApiKey) -> bool:
+    if key.prefix in findings.ended_keys and key.revoked_at is None:
         return True
-    ends = told.replaced_keys.get(key.prefix)
+    ends = findings.replaced_keys.get(key.prefix)
     return ends is not None and (key.expires_at is None or key.expires_at > ends)
 
 
-def _enrollments(told: _Told, context: StoreContext, connection: Connection) -> list[RecordProblem]:
+def _enrollments(
+    findings: LogFindings, context: StoreContext, connection: Connection
+) -> list[RecordProblem]:
     query = (
         sa.select(TenantRow.name, SubjectRow.subject_id, TemplateRow.template_id)
         .join(SubjectRow, SubjectRow.tenant_id == TenantRow.id)
@@ -179,12 +181,14 @@ def _enrollments(told: _Told, context: StoreContext, connection: Connection) -> 
     problems = []
     for tenant, subject_id, template_id in connection.execute(query):
         pseudonym = context.signer.pseudonym(tenant, subject_id)
-        if told.templates.get(pseudonym, template_id) != template_id:
+        if findings.templates.get(pseudonym, template_id) != template_id:
             problems.append(RecordProblem(ENROLLMENT_PUT_BACK, pseudonym))
     return problems
 
 
-def _counts(told: _Told, context: StoreContext, connection: Connection) -> list[RecordProblem]:
+def _counts(
+    findings: LogFindings, context: StoreContext, connection: Connection
+) -> list[RecordProblem]:
     columns = (
         FailedAttemptsRow.pseudonym,
         FailedAttemptsRow.consecutive,
@@ -194,7 +198,7 @@ def _counts(told: _Told, context: StoreContext, connection: Connection) -> list[
     stored = {row.pseudonym: row for row in connection.execute(sa.select(*columns))}
     return [
         RecordProblem(COUNT_LIFTED, pseudonym)
-        for pseudonym, failures in told.failures.items()
+        for pseudonym, failures in findings.failures.items()
         if failures.last_at > context.clock() - _FORGOTTEN_AFTER
         and not _holds(stored.get(pseudonym), failures)
     ]

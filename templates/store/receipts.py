@@ -2,8 +2,8 @@
 
 A receipt is a canonical JSON text (``templates.contract.canonical``) and its Ed25519 signature
 (RFC 8032). It names the subject by a pseudonym, HMAC-SHA256 of tenant and subject id under a secret
-of the deployment: a caller who has the subject id can ask the deployment for the receipt, and
-nobody else learns whom it is about. The receipt of a whole tenant is of another kind, and names the
+of the deployment: a caller with the subject id can ask the deployment for the receipt, and nobody
+else learns whom it is about. The receipt of a whole tenant is of another kind, and names the
 tenant.
 """
 

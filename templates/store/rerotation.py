@@ -111,8 +111,8 @@ class Rerotation:
         ------
         UnknownTenant
         StoreError
-            At the end, if templates do not open or are none: :meth:`subjects_of_old_epochs` names
-            their subjects, which must be enrolled again or erased. All others are moved.
+            At the end, if rows do not open or hold no template. All others are moved;
+            :meth:`subjects_of_old_epochs` names the subjects to enroll again or erase.
         """
         owner, database = self._tenants.get(tenant), self._context.database
         rotations = _Rotations(self._tenants, tenant, binding)

@@ -56,7 +56,7 @@ class RotationKey:
 
 
 class RetiredRotation(UnknownTenant):
-    """No key of this epoch any more: what was read in it was moved on since, read it again."""
+    """The key of this epoch is gone; its templates were moved. Read the template again."""
 
 
 class Tenants:

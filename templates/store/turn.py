@@ -2,8 +2,7 @@
 
 SQLite polls its lock, ever less often, and a process that writes without a pause frees it for less
 than a millisecond at a time: another one could wait until its timeout. So only one process waits
-for the lock at a time. The one that had it last has to wait for its turn first, which the other
-holds.
+for the lock at a time. A process that has just written queues behind it.
 """
 
 import contextlib

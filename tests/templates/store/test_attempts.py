@@ -23,7 +23,7 @@ from templates.store import (
     TemplateStore,
     UnknownTenant,
 )
-from templates.store.attempts import BEFORE, TRIES
+from templates.store.attempts import DECISION_QUERY, TRIES
 from templates.store.audit_log import token_digest
 from templates.store.schema import SubjectRow
 from tests.templates.store.conftest import CONTRACT, Clock, put, template_id
@@ -325,7 +325,7 @@ def test_a_subject_without_a_template_costs_as_many_bytes(store: TemplateStore) 
             "contract_id": CONTRACT,
             "token": None,
         }
-        row = store.database.read(lambda each: each.execute(BEFORE, parameters).one())
+        row = store.database.read(lambda each: each.execute(DECISION_QUERY, parameters).one())
         return [bytes(value) for value in row if isinstance(value, bytes) and len(value) > 1000]
 
     assert read("nobody") == []
