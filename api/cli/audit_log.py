@@ -50,9 +50,9 @@ def verify(
     """Check the audit log, and keys and lockouts against it; exit status 1 if anything is wrong.
 
     Names the first line that was altered, removed, added or moved. Where the log is whole, names
-    API keys that were made up, altered or put back after they ended, erased enrollments that were
-    put back, and counts of failed attempts that were lowered. What the lines of an archive told is
-    not looked at.
+    API keys that were made up, altered or put back after they ended, enrollments and tenants that
+    were put back, settings of tenants that were changed, and counts of failed attempts that were
+    lowered. What the lines of an archive tell is not looked at.
 
     Needs: the database and its master key: an attacker who can write the database but has no
     master key can write no line. The service may run meanwhile.
@@ -81,7 +81,7 @@ def verify(
     elif intact:
         checked = "" if kept is None else f", and holds the head of line {kept.sequence}"
         say(f"The audit log is intact: {report.lines} lines{checked}.")
-        say("API keys and counts of failed attempts are as it tells.")
+        say("Keys, tenants, enrollments and counts of failed attempts are as it tells.")
     if not intact:
         if problem is not None:
             message(f"line {problem.sequence}: {problem.what}")
