@@ -16,7 +16,7 @@ from api.cli.evaluation_inputs import (
     open_sources,
     wants_raw_flip,
 )
-from api.cli.evaluation_report import read_audit, summary, write_results
+from api.cli.evaluation_report import summary, write_results
 from api.cli.inputs import listed, named_file
 from api.cli.options import PROCESSOR, AsJson, Device, chosen_device, quick, takes_settings
 from api.settings import Settings
@@ -134,12 +134,6 @@ def evaluate(
         typer.Option(min=1, help="Threads here. Unset: one a processor, 8 at most."),
     ] = None,
     device: Device = PROCESSOR,
-    audit: Annotated[
-        Path | None,
-        typer.Option(
-            help="A `report.json` of `veilface audit`: adds the figure of privacy against accuracy."
-        ),
-    ] = None,
     _quick: Annotated[bool, quick(dim="4,16", metric="spherical", repeats=1)] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -154,7 +148,6 @@ def evaluate(
     require_extra("evaluate")
     torch_device = chosen_device(device, here=cluster is None)
     sets = open_all(datasets, pictures=embeddings is None)
-    report = None if audit is None else read_audit(audit)
     names = None
     if strategy is not None:
         names = listed(strategy, str, "--strategy", expected="names of strategies")
@@ -195,12 +188,11 @@ def evaluate(
                 "axes": axes,
                 "cluster": cluster is not None,
                 "labels": named_file(labels),
-                "audit": named_file(audit),
             },
             note=lambda sentence: message(f"note: {sentence}"),
             progress=progress,
         )
-    written = write_results(results, out, audit=report)
+    written = write_results(results, out)
     notice = {}
     if isinstance(embedder, PackEmbedder):
         info = embedder.pack.info

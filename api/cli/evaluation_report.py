@@ -8,7 +8,6 @@ from rich.table import Table
 
 from api.cli.console import table
 from api.cli.html_report import write_html
-from api.cli.inputs import read_json
 from templates.keys.private_file import replace_public
 from verify.evaluation.rows import Json
 from verify.evaluation.tables import markdown, write_csv
@@ -17,26 +16,10 @@ CAPTIONS = {
     "figure": "Accuracy by lifting and dimension, beside that of raw embeddings",
     "det": "False non-matches over false matches (DET)",
     "roc": "Genuine pairs accepted over false matches (ROC)",
-    "frontier": "Accuracy over what the strongest attackers learn",
 }
 
 
-def read_audit(file: Path) -> Json:
-    """Read the report of an audit, and check that it has what the figure needs.
-
-    Raises
-    ------
-    CommandError, DatasetError
-        It is no such report.
-    """
-    from verify.evaluation.figures.frontier import strongest_attackers
-
-    report = read_json(file)
-    strongest_attackers(report)
-    return dict(report)
-
-
-def write_results(results: Json, out: Path, *, audit: Json | None) -> list[Path]:
+def write_results(results: Json, out: Path) -> list[Path]:
     """Write the document, the tables, the figures and the HTML; return their files."""
     # Imported here: drawing loads a library that nothing else needs.
     from verify.evaluation.figures import write_figures
@@ -44,14 +27,14 @@ def write_results(results: Json, out: Path, *, audit: Json | None) -> list[Path]
     text = json.dumps(results, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
     files = [out / "results.json", out / "results.csv", out / "results.md"]
     # What an earlier run drew of other rows must not stand beside these.
-    for name in ("figure", "det", "roc", "frontier"):
+    for name in ("figure", "det", "roc"):
         for suffix in (".png", ".svg"):
             (out / f"{name}{suffix}").unlink(missing_ok=True)
     replace_public(files[0], text.encode())
     write_csv(results, files[1])
     report = markdown(results)
     replace_public(files[2], report.encode())
-    figures = write_figures(results, out, audit=audit)
+    figures = write_figures(results, out)
     return [*files, *figures, write_html(out / "results.html", report, figures, CAPTIONS)]
 
 

@@ -325,20 +325,3 @@ def test_attributes_are_predicted_from_a_labelled_pool(bench, tmp_path):
     assert ran.json["options"]["predicted_attributes"] == {"lfw": images}
     (row,) = ran.json["rows"]
     assert (row["strategy"], row["decoys"], row["shared_decoys"]) == ("hybrid+", "pool", True)
-
-
-def test_an_audit_adds_the_frontier(bench, tmp_path):
-    rows = [
-        {
-            **{"strategy": "random", "decoys": None, "dim": 2, "attribute": "gender"},
-            **{"attacker": "knn", "accuracy": 0.7, "chance": 0.5},
-        }
-    ]
-    audit = tmp_path / "report.json"
-    audit.write_text(json.dumps({"format": "veilface audit", "rows": rows}))
-    ran = run(
-        *("evaluate", bench.lfw, *bench.base, "--strategy", "raw,random", "--dim", "2"),
-        *("--repeats", "1", "--fmr", "0.2", "--audit", audit, "--out", tmp_path / "out", "--json"),
-    )
-    assert ran.status == 0, ran.stderr
-    assert ran.json["files"] == [*FILES[:-1], "frontier.png", "frontier.svg", FILES[-1]]

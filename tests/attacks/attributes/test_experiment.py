@@ -17,7 +17,6 @@ from attacks.outcomes import GENERATED, POOLED, RAW_SCHEME, Knowledge, Scheme
 from templates.decoys import DecoyGenerator
 from templates.distances import on_device
 from tests.attacks.attributes.people import faces
-from verify.evaluation.figures.frontier import FIELDS
 
 PLAN = AttributePlan(feature_ks=(10,))
 Found = dict[tuple[str, str], AttributeRow]
@@ -252,12 +251,10 @@ def test_a_part_of_the_gallery_teaches_and_all_of_it_votes(scheme: Scheme) -> No
     assert [row.held_out for row in one] != [row.held_out for row in other]
 
 
-def test_rows_have_what_the_frontier_reads_and_the_best_is_chosen_before_the_victims() -> None:
+def test_the_best_attacker_is_chosen_before_the_victims() -> None:
     rows = attacked(PLUS)
     for row in rows:
         document = row.to_json()
-        for name, kind in FIELDS.items():
-            assert isinstance(document[name], kind), name
         assert np.sum(document["confusion"]) == document["trials"] == 400
     chosen = strongest(rows)
     assert set(chosen) == {

@@ -78,23 +78,6 @@ def sample_results(
     }
 
 
-def sample_audit(results: dict[str, Any], *, attackers: Sequence[str] = ("k-nn", "mlp")) -> Any:
-    """An audit of the same configurations, by two attackers."""
-    rng = np.random.default_rng(1)
-    keys = {(r["strategy"], r["decoys"], r["dim"]) for r in results["rows"]}
-    return {
-        "format": "veilface audit",
-        "rows": [
-            {"strategy": strategy, "decoys": decoys, "dim": dim, "attribute": attribute}
-            | {"attacker": attacker, "chance": chance}
-            | {"accuracy": chance + _leak(strategy, dim) * (1 - chance) + rng.uniform(0, 0.02)}
-            for strategy, decoys, dim in sorted(keys, key=str)
-            for attribute, chance in (("gender", 0.533), ("race", 0.193))
-            for attacker in attackers
-        ],
-    }
-
-
 def _leak(strategy: str, dim: int) -> float:
     if strategy.startswith(("raw", "random")):
         return 0.6

@@ -16,17 +16,14 @@ from matplotlib.figure import Figure
 from PIL import Image
 from scipy.special import ndtri
 
-from tests.verify.evaluation.sample_results import sample_audit, sample_results
-from verify.datasets import DatasetError
+from tests.verify.evaluation.sample_results import sample_results
 from verify.evaluation.figures import (
     det_figure,
-    frontier_figure,
     roc_figure,
     verification_figure,
     write_figures,
 )
 from verify.evaluation.figures.curves import shown_curves
-from verify.evaluation.figures.frontier import strongest_attackers
 
 PAPER = (("random", None), ("adversarial", "pool"), ("hybrid", "pool"))
 
@@ -164,90 +161,13 @@ def test_a_panel_has_the_ends_of_m_and_raw() -> None:
         assert any(label.startswith("solid: m = ") for label in legend(figure))
 
 
-def test_a_point_of_the_frontier_is_the_strongest_attacker_against_the_accuracy() -> None:
-    results = sample_results(liftings=PAPER, dims=(2, 16))
-    audit = sample_audit(results)
-    panels = drawn(frontier_figure(results, audit))
-    assert len(panels) == 4
-    for panel, (mode, attribute) in zip(
-        panels, [(m, a) for m in ("p2s", "s2s") for a in ("gender", "race")], strict=True
-    ):
-        assert panel.get_xlabel().startswith(attribute)
-        line = labelled(panel, "adversarial (pool)")
-        expected = []
-        for dim in (2, 16):
-            (row,) = select(results, strategy="adversarial", dim=dim, mode=mode, metric="spherical")
-            attacks = [
-                a["accuracy"]
-                for a in audit["rows"]
-                if (a["strategy"], a["dim"], a["attribute"]) == ("adversarial", dim, attribute)
-            ]
-            assert len(attacks) == 2
-            expected.append((100 * max(attacks), 100 * row["accuracy_mean"]))
-        assert np.column_stack(line.get_data()) == pytest.approx(np.array(expected))
-        chance = 53.3 if attribute == "gender" else 19.3
-        assert labelled(panel, "chance").get_xdata()[0] == pytest.approx(chance)
-    assert {"m = 2", "m = 16", "chance", "raw"} <= set(legend(frontier_figure(results, audit)))
-
-
-def test_an_audit_without_its_fields_is_refused() -> None:
-    results = sample_results(liftings=PAPER, dims=(2,))
-    audit = sample_audit(results)
-    del audit["rows"][0]["chance"], audit["rows"][0]["attacker"]
-    audit["rows"][2]["accuracy"] = 51.2
-    audit["rows"][3]["dim"] = "2"
-    said = r"row 0: lacks attacker, chance; row 2: accuracy is 51\.2.*; row 3: dim is str"
-    with pytest.raises(DatasetError, match=said):
-        frontier_figure(results, audit)
-    for wrong, reason in (
-        ({}, "not an audit report"),
-        ([], "not an audit report"),
-        ({"format": "veilface audit"}, "no rows"),
-        ({"format": "veilface audit", "rows": [1]}, "row 0: is not an object"),
-    ):
-        with pytest.raises(DatasetError, match=reason):
-            frontier_figure(results, wrong)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [
-        *((name, "x" * 65) for name in ("strategy", "decoys", "attribute", "attacker")),
-        *((name, "a\x1b[2J") for name in ("strategy", "decoys", "attribute", "attacker")),
-        *(("accuracy", value) for value in (float("nan"), float("inf"), -1e-9, 10**400)),
-        *(("chance", value) for value in (float("nan"), float("-inf"), 1.01)),
-        *(("dim", value) for value in (-1, 2**16 + 1, 10**400)),
-    ],
-)
-def test_an_audit_with_values_out_of_range_is_refused(field: str, value: object) -> None:
-    results = sample_results(liftings=PAPER, dims=(2,))
-    audit = sample_audit(results)
-    audit["rows"][1][field] = value
-    with pytest.raises(DatasetError, match=f"row 1: {field} is ") as caught:
-        strongest_attackers(audit)
-    assert len(str(caught.value)) < 200
-    assert str(caught.value).isprintable()
-
-
-def test_an_audit_of_more_attributes_than_a_figure_has_columns_is_refused() -> None:
-    results = sample_results(liftings=PAPER, dims=(2,))
-    row = sample_audit(results)["rows"][0]
-    rows = [row | {"attribute": f"a{number}"} for number in range(17)]
-    assert len(strongest_attackers({"format": "veilface audit", "rows": rows[:16]})) == 16
-    with pytest.raises(DatasetError, match="17 attributes, and 16 are the most"):
-        strongest_attackers({"format": "veilface audit", "rows": rows})
-
-
 @pytest.mark.long
 def test_a_name_is_no_formula(tmp_path: Path) -> None:
     results = sample_results(liftings=PAPER, dims=(2, 16))
     for part in ("rows", "datasets", "curves"):
         for entry in results[part]:
             entry["name" if part == "datasets" else "dataset"] = r"$\frac{1}{$ & $x$"
-    audit = sample_audit(results)
-    for row in audit["rows"]:
-        row["attribute"] = "$x^2$"
-    for path in write_figures(results, tmp_path, audit=audit):
+    for path in write_figures(results, tmp_path):
         if path.suffix == ".svg":
             root = ElementTree.fromstring(path.read_text(encoding="utf-8"))
             words = ["".join(e.itertext()) for e in root.iter("{http://www.w3.org/2000/svg}text")]
@@ -257,17 +177,16 @@ def test_a_name_is_no_formula(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_files_are_complete_readable_and_the_same_each_time(tmp_path: Path) -> None:
     results = sample_results(liftings=PAPER, dims=(2, 16))
-    audit = sample_audit(results)
     matplotlib.rcParams["font.size"], before = 31.0, matplotlib.rcParams["font.size"]
     try:
         paths = []
         for name in ("one", "two"):
             (tmp_path / name).mkdir()
-            paths.append(write_figures(results, tmp_path / name, audit=audit))
+            paths.append(write_figures(results, tmp_path / name))
         assert matplotlib.rcParams["font.size"] == 31.0
     finally:
         matplotlib.rcParams["font.size"] = before
-    names = [f"{n}.{s}" for n in ("figure", "det", "roc", "frontier") for s in ("png", "svg")]
+    names = [f"{n}.{s}" for n in ("figure", "det", "roc") for s in ("png", "svg")]
     assert [path.name for path in paths[0]] == names
     for first, second in zip(*paths, strict=True):
         assert first.read_bytes() == second.read_bytes()
@@ -294,8 +213,6 @@ def test_a_figure_without_content_is_left_out(tmp_path: Path) -> None:
     assert names == ["det.png", "det.svg", "roc.png", "roc.svg"]
     only_raw["curves"] = []
     assert write_figures(only_raw, tmp_path) == []
-    audit = sample_audit(sample_results(liftings=PAPER, dims=(2,)))
-    assert write_figures(only_raw, tmp_path, audit=audit) == []
 
 
 def test_only_the_figures_import_matplotlib_and_never_pyplot() -> None:
