@@ -1,14 +1,12 @@
 """Lists, files and decoys that bulk commands are given."""
 
 import hashlib
-import json
 from collections.abc import Callable, Sequence
 from pathlib import Path, PurePath
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from api.cli.descriptors import extract
 from api.cli.errors import CommandError, UsageError
-from api.cli.files import read_bounded
 from api.cli.photo_folders import find_photos
 from api.process.preparation import require_made_with
 from api.settings import Settings
@@ -21,7 +19,6 @@ from verify.evaluation.embeddings_file import read_embeddings
 from verify.fairface_labels import Label, read_labels
 
 T = TypeVar("T")
-_MAX_JSON_BYTES = 64 * 2**20
 
 
 def listed(text: str, kind: Callable[[str], T], option: str, *, expected: str) -> tuple[T, ...]:
@@ -85,14 +82,6 @@ def listed_dims(text: str, option: str, *, n: int, example: str) -> tuple[int, .
     if wrong:
         raise UsageError(f"{option} takes dimensions from 1 to {n - 1}, not {wrong[0]}")
     return dims
-
-
-def read_json(file: Path) -> Any:
-    """Read a JSON file, such as a report that another command wrote."""
-    try:
-        return json.loads(read_bounded(file, _MAX_JSON_BYTES))
-    except (ValueError, RecursionError):
-        raise CommandError(f"{file.name} is not a JSON file") from None
 
 
 def named_file(file: Path | None) -> dict[str, Json] | None:
