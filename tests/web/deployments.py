@@ -1,6 +1,5 @@
 """The services that the page is looked at with: the demo's, and one with a real pack."""
 
-import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -16,7 +15,6 @@ from models.pack import ModelPack
 from templates.contract.document import Contract
 from templates.distances.blas import single_threaded
 from tests.api.deployment import deploy, images
-from tests.api.http.test_contract_audit import report
 from tests.api.real_people import calibrated_on_lfw
 from tests.clients.conftest import Running, started
 from tests.marked_heads import frame, write_marked_pack
@@ -66,17 +64,7 @@ def real_service(folder: Path, pack: Path, aligned: Path) -> Iterator[Served]:
     # Their own templates score above 9.9, strangers' below 3.6 (2,000 templates).
     contract = _beyond_chance(calibrated, 6.0)
     contract.save(settings.resolved_contract_file, file_sealer(open_keyring(settings)))
-    audit = folder / "report.json"
-    audit.write_text(
-        json.dumps(
-            report(
-                contract.binding.m,
-                axes=contract.binding.axes,
-                settings={"contract_id": contract.contract_id},
-            )
-        )
-    )
-    options = {"--data-dir": settings.data_dir, "--pack": pack, "--audit-report-file": audit}
+    options = {"--data-dir": settings.data_dir, "--pack": pack}
     flags = ["--accept-weak-privacy", *(str(part) for option in options.items() for part in option)]
     with serving(folder, settings, *flags) as served:
         yield served
