@@ -142,7 +142,8 @@ class Entry:
         Of the subject it was done to (:meth:`ReceiptSigner.pseudonym`). Never a subject id:
         anything but 64 hexadecimal digits is refused.
     detail
-        What else it was done with: the level of a verification, the prefix of a key.
+        What else it was done with: the level of a verification, the prefix of a key, the digest
+        of an enrollment's template id (:func:`template_digest`).
     token
         Of the one-use token that it used up (:func:`token_digest`).
     """
@@ -237,6 +238,11 @@ def token_digest(key_prefix: str, value: str) -> str:
         Its random id.
     """
     return hashlib.sha256(encode_parts("token", key_prefix, value)).hexdigest()
+
+
+def template_digest(template_id: str) -> str:
+    """What the log keeps of a template's id, which itself goes when the subject is erased."""
+    return hashlib.sha256(encode_parts("template", template_id)).hexdigest()
 
 
 def line_mac(key: bytes, values: Mapping[str, Any], previous: bytes) -> bytes:

@@ -15,7 +15,13 @@ from sqlalchemy.engine import Connection
 from templates.errors import StoreError
 from templates.store.api_keys import ApiKey, ApiKeys
 from templates.store.attempts import COUNT_RETENTION
-from templates.store.audit_log import TENANT_ERASE, Anchor, AuditLog, Verification
+from templates.store.audit_log import (
+    TENANT_ERASE,
+    Anchor,
+    AuditLog,
+    Verification,
+    template_digest,
+)
 from templates.store.context import StoreContext
 from templates.store.schema import FailedAttemptsRow, SubjectRow, TemplateRow, TenantRow
 
@@ -181,7 +187,8 @@ def _enrollments(
     problems = []
     for tenant, subject_id, template_id in connection.execute(query):
         pseudonym = context.signer.pseudonym(tenant, subject_id)
-        if findings.templates.get(pseudonym, template_id) != template_id:
+        digest = template_digest(template_id)
+        if findings.templates.get(pseudonym, digest) != digest:
             problems.append(RecordProblem(ENROLLMENT_PUT_BACK, pseudonym))
     return problems
 

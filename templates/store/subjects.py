@@ -10,7 +10,7 @@ from sqlalchemy.engine import Connection
 
 from templates.errors import StoreBusy, StoreError
 from templates.keys.sealing import sealed_key_id
-from templates.store.audit_log import PROGRAM, By, Entry, is_used
+from templates.store.audit_log import PROGRAM, By, Entry, is_used, template_digest
 from templates.store.context import StoreContext
 from templates.store.cursors import close_cursor, open_cursor
 from templates.store.envelope import Envelope, Owner, close_envelope
@@ -190,7 +190,8 @@ class Subjects:
             now = context.clock()
             _write_rows(connection, owner, envelope, metadata, is_new=is_new, now=now)
             outcome = "created" if is_new else "replaced"
-            entry = Entry(action, outcome, by, tenant, pseudonym, template_id, token)
+            detail = template_digest(template_id)
+            entry = Entry(action, outcome, by, tenant, pseudonym, detail, token)
             context.audit_log.append(connection, entry)
             return StoredTemplate(template_id, is_new)
 

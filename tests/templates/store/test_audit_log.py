@@ -26,7 +26,7 @@ from templates.store import (
     UnknownTenant,
     verify_archive,
 )
-from templates.store.audit_log import START, token_digest
+from templates.store.audit_log import START, template_digest, token_digest
 from templates.store.database import Database
 from templates.store.schema import AuditRow, SubjectRow
 from templates.store.secrets import SecretName
@@ -241,8 +241,8 @@ def test_every_write_has_its_line(store: TemplateStore) -> None:
         (line.action, line.outcome, line.tenant, line.pseudonym, line.detail, line.token)
         for line in lines
     ] == [
-        ("enroll", "created", "default", ada, one.template_id, None),
-        ("enroll", "replaced", "default", ada, two.template_id, TOKEN),
+        ("enroll", "created", "default", ada, template_digest(one.template_id), None),
+        ("enroll", "replaced", "default", ada, template_digest(two.template_id), TOKEN),
         ("erase", "erased", "default", ada, None, None),
         ("erase", "receipt_repeated", "default", ada, None, None),
         ("erase", "nothing_held", "default", eve, None, None),
