@@ -460,7 +460,7 @@ class AuditLog:
         return Verification(count, last, None)
 
     def lines_after(self, connection: Connection, last: Anchor) -> Iterator[Mapping[str, Any]]:
-        """Columns of the lines after the last one of a walk, in a write, up to the first break."""
+        """Columns of the lines after the last one of a walk, up to the first break."""
         query = LINES.where(AuditRow.sequence > last.sequence).order_by(AuditRow.sequence)
         rows: Any = connection.execute(query).all()
         for row in rows:

@@ -97,11 +97,21 @@ class Database:
         StoreUnavailable, StoreError
             In our own words, without a statement, its parameters or a row.
         """
+        return self._read(self._process().readers, work)
+
+    def snapshot(self, work: Callable[[Connection], T]) -> T:
+        """:meth:`read`, where all queries of `work` see the same moment; no write waits for it."""
         process = self._process()
-        with _translating(), process.readers.connect() as connection:
+        if self.is_sqlite:  # whose readers see one moment anyway
+            return self._read(process.readers, work)
+        level = {"isolation_level": "REPEATABLE READ"}
+        return self._read(process.engine.execution_options(**level), work)
+
+    def _read(self, engine: Engine, work: Callable[[Connection], T]) -> T:
+        with _translating(), engine.connect() as connection:
             if self.is_sqlite:
                 _driver(connection).execute("BEGIN")
-                process.require_file()
+                self._process().require_file()
             return work(connection)
 
     def write(self, work: Callable[[Connection], T], *, wait: float | None = None) -> T:

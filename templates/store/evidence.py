@@ -131,7 +131,7 @@ def verify_log_and_records(
         return verification, ()
 
     def work(connection: Connection) -> tuple[RecordProblem, ...]:
-        # No other write runs now, so no line is younger than a row.
+        # Lines and rows of one moment.
         for line in log.lines_after(connection, verification.head):
             findings.read(line)
         return (
@@ -141,7 +141,7 @@ def verify_log_and_records(
             *_counts(findings, context, connection),
         )
 
-    return verification, context.database.write(work)
+    return verification, context.database.snapshot(work)
 
 
 def _keys(findings: LogFindings, api_keys: ApiKeys, connection: Connection) -> list[RecordProblem]:

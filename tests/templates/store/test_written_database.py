@@ -5,6 +5,7 @@ back, and the service takes it: the verification of the audit log reports it.
 """
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -21,6 +22,7 @@ from templates.store.evidence import (
     TENANT_ALTERED,
     TENANT_PUT_BACK,
 )
+from tests.patience import PATIENCE_S
 from tests.templates.store.conftest import Clock, put
 from tests.templates.store.test_attempts import attempt
 
@@ -234,6 +236,19 @@ def test_what_an_archive_tells_is_not_looked_at(store: TemplateStore, tmp_path: 
     put_back(store, "api_keys", lambda: store.api_keys.revoke(made.key.prefix))
     store.archive_audit_log(tmp_path / "audit.jsonl", through=None)
     assert reported(store) == []
+
+
+def test_rows_are_looked_at_beside_a_write(store: TemplateStore) -> None:
+    attempt(store)
+
+    def work(connection: Connection) -> None:
+        connection.execute(sa.text("UPDATE failed_attempts SET consecutive = 0"))
+        with ThreadPoolExecutor(1) as thread:
+            verification, records = thread.submit(store.verify_audit_log).result(PATIENCE_S)
+        assert (verification.intact, records) == (True, ())
+
+    store.database.write(work)
+    assert reported(store) != []
 
 
 def test_rows_are_looked_at_only_where_the_log_is_whole(store: TemplateStore) -> None:
