@@ -17,6 +17,7 @@ from templates.store.api_keys import NewApiKey
 from templates.store.database import Database
 from templates.store.schema import ApiKeyRow
 from tests.templates.store.conftest import Clock
+from tests.templates.store.test_database import with_options
 
 
 def test_a_token_finds_its_key(store: TemplateStore, clock: Clock) -> None:
@@ -269,3 +270,21 @@ def test_a_key_keeps_its_lowest_level_and_so_does_the_one_that_replaces_it(
     assert new.key.lowest_level == "fmr-1e-5"
     with pytest.raises(StoreError, match="name of a level"):
         store.api_keys.create("default", [Right.VERIFY], lowest_level="Not A Level")
+
+
+def test_a_read_only_database_refuses_no_good_key(
+    postgres_url: str, keyring: MasterKeyring
+) -> None:
+    store = TemplateStore(postgres_url, keyring)
+    store.upgrade()
+    store.tenants.create("default")
+    token = store.api_keys.create("default", [Right.VERIFY]).token
+    read_only = TemplateStore(
+        with_options(postgres_url, "-c default_transaction_read_only=on"), keyring
+    )
+    key = read_only.api_keys.verify(token)
+    assert key is not None
+    with pytest.raises(StoreError):
+        read_only.api_keys.revoke(key.prefix)
+    store.close()
+    read_only.close()
