@@ -12,7 +12,7 @@ from api.cli.console import emit, message, progress, say, say_lines
 from api.cli.errors import UsageError
 from api.cli.files import read_bounded
 from api.cli.options import STORE, AsJson, takes_settings
-from api.cli.public_key import read_public_key
+from api.cli.public_key import PublicKey, read_public_key
 from api.http.audit import operator
 from api.http.values import iso_time
 from api.process.opening import checked_store
@@ -122,13 +122,7 @@ def archive(
 def verify_archive_file(
     file: Annotated[Path, typer.Argument(help="What `archive` wrote.")],
     *,
-    public_key: Annotated[
-        str,
-        typer.Option(
-            help="The service's receipt key in base64, or a file with the JSON of "
-            "`GET /v1/contract`."
-        ),
-    ],
+    public_key: PublicKey,
     as_json: AsJson = False,
 ) -> None:
     """Check an archive's signature and lines; exit status 1 if they are not good.

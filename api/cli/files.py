@@ -4,6 +4,8 @@ from pathlib import Path
 
 from api.cli.errors import CommandError, UsageError
 
+MAX_CONTRACT_BYTES = 2**28
+
 
 def read_bounded(path: Path, most: int) -> bytes:
     """Read a file that has at most ``most`` bytes."""

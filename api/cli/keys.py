@@ -13,7 +13,7 @@ from api.cli.files import read_bounded
 from api.cli.master_keys import FILES, opened_store
 from api.cli.new_key import show_once
 from api.cli.options import STORE, AsJson, Tenant, takes_settings
-from api.cli.public_key import read_public_key
+from api.cli.public_key import PublicKey, read_public_key
 from api.http.audit import operator
 from api.http.receipts import verify_answer
 from api.process.opening import open_contract, open_keyring
@@ -257,13 +257,7 @@ for _command in (master_keys.master, master_keys.rotate, master_keys.rewrap, ren
 def verify_receipt(
     receipt: Annotated[Path, typer.Argument(help="JSON that the DELETE call returned.")],
     *,
-    public_key: Annotated[
-        str,
-        typer.Option(
-            help="The service's receipt key in base64, or a file with the JSON of "
-            "`GET /v1/contract`."
-        ),
-    ],
+    public_key: PublicKey,
     as_json: AsJson = False,
 ) -> None:
     """Verify an erasure receipt; exit status 1 if it is not valid.

@@ -9,7 +9,7 @@ import typer
 
 from api.cli.console import counted, demo_notice, emit, say
 from api.cli.errors import CommandError, UsageError
-from api.cli.files import read_bounded, read_photo
+from api.cli.files import MAX_CONTRACT_BYTES, read_bounded, read_photo
 from api.cli.options import AsJson
 from enroll.enroller import MAX_PHOTOS
 from enroll.public_contract import PublicContract
@@ -22,7 +22,6 @@ from templates.keys.holder_key import encode_holder_key, read_holder_key
 from templates.keys.private_file import replace_private
 from templates.space.agreement import InconsistentImages
 
-MAX_CONTRACT_BYTES = 256 * 2**20
 MAX_PHOTO_BYTES = 64 * 2**20
 
 

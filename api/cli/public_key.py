@@ -1,15 +1,22 @@
 """The public key that receipts and archives are verified with, as a command line names it."""
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import typer
 
 from api.cli.errors import UsageError
-from api.cli.files import read_bounded
+from api.cli.files import MAX_CONTRACT_BYTES, read_bounded
 from api.http.receipts import read_receipt_key
 from templates.contract.canonical import parse_object
 from templates.errors import StoreError
 
-MAX_CONTRACT_BYTES = 2**28
+PublicKey = Annotated[
+    str,
+    typer.Option(
+        help="The service's receipt key in base64, or a file with the JSON of `GET /v1/contract`."
+    ),
+]
 
 
 def read_public_key(text: str) -> bytes:
