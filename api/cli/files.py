@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from api.cli.errors import CommandError, UsageError
+from templates.keys.private_file import read_at_most
 
 MAX_CONTRACT_BYTES = 2**28
 
@@ -10,7 +11,7 @@ MAX_CONTRACT_BYTES = 2**28
 def read_bounded(path: Path, most: int) -> bytes:
     """Read a file that has at most ``most`` bytes."""
     with path.open("rb") as file:
-        data = file.read(most + 1)
+        data = read_at_most(file, most)
     if len(data) > most:
         raise CommandError(f"{path} has more than {most} bytes; is it the right file?")
     return data
