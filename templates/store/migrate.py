@@ -39,10 +39,9 @@ def current_revision(database: Database) -> str | None:
     return database.read(_revision_of)
 
 
-@functools.cache
 def head_revision() -> str:
     """Revision this program needs."""
-    head = ScriptDirectory.from_config(_config(None)).get_current_head()
+    head = _scripts().get_current_head()
     assert head is not None, "the package holds at least one migration"  # noqa: S101
     return head
 
@@ -75,13 +74,17 @@ def _revision_of(connection: Connection) -> str | None:
 
 
 def _require_known(revision: str | None) -> None:
-    scripts = ScriptDirectory.from_config(_config(None))
-    known = {script.revision for script in scripts.walk_revisions()}
+    known = {script.revision for script in _scripts().walk_revisions()}
     if revision is not None and revision not in known:
         raise StoreError(
             f"the database is at schema {revision}, which this program does not know: "
             "another version migrated it, install that one"
         )
+
+
+@functools.cache
+def _scripts() -> ScriptDirectory:
+    return ScriptDirectory.from_config(_config(None))
 
 
 def _config(connection: Connection | None) -> Config:
