@@ -20,7 +20,7 @@ from attacks.report import RESULTS, Document
 from attacks.report_tables import markdown
 from attacks.verdict import LIMITS
 from models.pack import ModelPack
-from templates.keys.private_file import make_folder, replace_public
+from templates.keys.private_file import replace_public
 
 Out = Annotated[Path, typer.Option(help="Folder of the report.")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed for everything random.")]
@@ -97,7 +97,7 @@ def write_report(report: Document, out: Path) -> list[Path]:
     # Imported here: drawing loads a library that nothing else needs.
     from attacks.figures import write_figures
 
-    make_folder(out)
+    out.mkdir(parents=True, exist_ok=True)
     files = [out / "report.json", out / "report.md"]
     text = json.dumps(report, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
     replace_public(files[0], text.encode())

@@ -15,7 +15,6 @@ from models.cache import EmbeddingCache
 from models.extraction import Extraction, Extractor
 from models.pack import ModelPack
 from models.sessions import default_workers
-from templates.keys.private_file import make_folder
 
 BULK = ("pack", "providers", "data_dir", "database_url", "master_key_file")
 
@@ -57,7 +56,7 @@ def open_cache(cache: Path | None, settings: Settings) -> EmbeddingCache | None:
     """Open the sealed cache of embeddings, where one is named; make the folder that it goes to."""
     if cache is None:
         return None
-    make_folder(cache.parent)
+    cache.parent.mkdir(parents=True, exist_ok=True)
     return EmbeddingCache.open_file(cache, file_sealer(open_keyring(settings)))
 
 

@@ -21,7 +21,6 @@ from api.cli.inputs import listed, named_file
 from api.cli.options import PROCESSOR, AsJson, Device, chosen_device, quick, takes_settings
 from api.settings import Settings
 from templates.distances import Metric
-from templates.keys.private_file import make_folder
 from verify.evaluation.cluster import cluster as dask_cluster
 from verify.evaluation.embedder import PackEmbedder
 from verify.evaluation.experiment import run_evaluation
@@ -172,7 +171,7 @@ def evaluate(
         raise UsageError(str(error)) from None
     known = None if labels is None else read_labels(labels)
     kept = open_cache(cache, settings)
-    make_folder(out)
+    out.mkdir(parents=True, exist_ok=True)
     local = ThreadPoolExecutor(jobs or default_jobs())
     with local if cluster is None else dask_cluster(cluster) as executor:
         results = run_evaluation(

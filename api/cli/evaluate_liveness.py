@@ -19,7 +19,7 @@ from attacks.impostor_presentations import verify_presentations
 from models.liveness import PassiveLiveness
 from models.pack import ModelPack
 from templates.contract.document import Contract
-from templates.keys.private_file import make_folder, replace_public
+from templates.keys.private_file import replace_public
 from verify.datasets import DatasetError
 from verify.evaluation.liveness.document import (
     CONTRACT_POINT,
@@ -115,7 +115,7 @@ def evaluate_liveness(
         unverified=unverified,
         refused=refused,
     )
-    make_folder(out)
+    out.mkdir(parents=True, exist_ok=True)
     written = _write(results, out)
     notice = demo_notice(pack.info.embedder_sha256, n=pack.info.n)
     if as_json:

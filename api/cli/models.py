@@ -19,7 +19,7 @@ from models.liveness import LivenessGraph
 from models.pack import ModelPack, PackInfo
 from models.pack_file import FILE_NAME, pack_file_text
 from models.pack_graphs import inspect as inspect_pack
-from templates.keys.private_file import make_folder, replace_public
+from templates.keys.private_file import replace_public
 
 NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,63}")
 MAX_NAMES, MAX_NAME = 10, 100
@@ -99,11 +99,11 @@ def fetch(
         raise CommandError(f"{target} is there already; remove it, or take another name")
     _require_licence(accept_licence)
     pins: Sequence[str | None] = sha256 or [None] * len(sources)
-    make_folder(into)
+    into.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".fetch-", dir=into) as scratch:
         # Of the pack's own name, which what is wrong with it names.
         folder = Path(scratch) / name
-        make_folder(folder)
+        folder.mkdir(parents=True, exist_ok=True)
         digests = {}
         for source, pin in zip(sources, pins, strict=True):
             digests[shown(source)], left_out = _fetch_one(source, folder, pin)

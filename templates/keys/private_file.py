@@ -7,8 +7,8 @@ service could not read it afterwards, and a user could have chosen the place.
 import errno
 import os
 import pwd
+import secrets
 import stat
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO
@@ -35,10 +35,8 @@ def replace_private(path: Path, data: bytes) -> None:
 
 def replace_public(path: Path, data: bytes) -> None:
     """Replace a file as :func:`replace_private` does; the umask says who may read it."""
-    target, umask = Path(os.path.realpath(path)), os.umask(0)
-    os.umask(umask)
-    mode = 0o666 & ~umask
-    _write(path, target, data, mode=mode, place=lambda draft: draft.replace(target))
+    target = Path(os.path.realpath(path))
+    _write(path, target, data, mode=0o666, place=lambda draft: draft.replace(target))
 
 
 def create_private(path: Path, data: bytes) -> None:
@@ -57,17 +55,6 @@ def create_private(path: Path, data: bytes) -> None:
         draft.unlink()
 
     _write(path, path.parent.resolve() / path.name, data, mode=0o600, place=place)
-
-
-def make_folder(path: Path) -> None:
-    """Make a folder, and those above it, where they are missing.
-
-    Raises
-    ------
-    OSError
-        It cannot be made.
-    """
-    path.mkdir(parents=True, exist_ok=True)
 
 
 def refuse_another_users(path: Path) -> None:
@@ -162,11 +149,11 @@ def _write(
         for each in (path, target, path.parent, target.parent):  # a link of theirs leads anywhere
             refuse_another_users(each)
         target.parent.mkdir(mode=0o700 if mode == 0o600 else 0o777, parents=True, exist_ok=True)
-        descriptor, name = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
-        draft = Path(name)
+        draft = target.parent / f".{target.name}.{secrets.token_hex(4)}"
+        # So that the kernel applies the umask; to read it, one has to set it for all threads.
+        descriptor = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
         try:
             with os.fdopen(descriptor, "wb") as file:
-                os.fchmod(descriptor, mode)
                 file.write(data)
                 file.flush()
                 os.fsync(descriptor)
