@@ -99,14 +99,13 @@ class TemplateStore:
         made = self.secrets.make_missing(connection)
         if not made:
             return
-        if connection.execute(sa.select(AuditHeadRow.id)).first() is not None:
+        has_begun = connection.execute(sa.select(AuditHeadRow.id)).first() is not None
+        if has_begun or SecretName.CHAIN not in made:
             raise BrokenAuditLog(
                 f"secrets of the deployment are missing ({', '.join(sorted(made))}): "
                 "restore the database from a backup"
             )
-        query = sa.select(SecretRow.wrapped_value).where(SecretRow.name == SecretName.CHAIN)
-        sealed = connection.execute(query).scalar_one()
-        self.audit_log.begin(connection, self.secrets.opened(SecretName.CHAIN, sealed))
+        self.audit_log.begin(connection, made[SecretName.CHAIN])
 
     def check(self) -> None:
         """Raise, naming the remedy, unless schema and master key are the right ones."""

@@ -67,34 +67,35 @@ class Secrets:
         query = sa.select(SecretRow.name, SecretRow.wrapped_value)
         rows = self._database.read(lambda connection: connection.execute(query).all())
         try:
-            self._opened = {name: self.opened(name, sealed) for name, sealed in rows}
+            self._opened = {
+                name: self._keyring.open(sealed, purpose=SECRET_PURPOSE, bound_to=[name])
+                for name, sealed in rows
+            }
         except SealError as error:
             raise SealError(f"this is not the master key of this database: {error}") from None
 
-    def opened(self, name: str, sealed: bytes) -> bytes:
-        """Open the stored value of a secret."""
-        return self._keyring.open(sealed, purpose=SECRET_PURPOSE, bound_to=[name])
-
-    def make_missing(self, connection: Connection) -> set[SecretName]:
-        """Draw the secrets that the database lacks, in a write; returns which."""
+    def make_missing(self, connection: Connection) -> dict[SecretName, bytes]:
+        """Draw the secrets that the database lacks, in a write; returns them by name."""
         present = set(connection.execute(sa.select(SecretRow.name)).scalars())
-        missing = {name for name in SecretName if name not in present}
-        for name in missing:
-            row = {"name": name, "created_at": self._clock(), **self._drawn(name)}
-            connection.execute(sa.insert(SecretRow).values(row))
-        return missing
+        made = {}
+        for name in SecretName:
+            if name not in present:
+                made[name], columns = self._drawn(name)
+                row = {"name": name, "created_at": self._clock(), **columns}
+                connection.execute(sa.insert(SecretRow).values(row))
+        return made
 
     def renew(self, connection: Connection, name: SecretName) -> bytes:
         """Draw a secret anew, in a write; every process reads it when it starts again."""
-        values = self._drawn(name)
-        connection.execute(sa.update(SecretRow).where(SecretRow.name == name).values(values))
-        return self.opened(name, values["wrapped_value"])
+        secret, columns = self._drawn(name)
+        connection.execute(sa.update(SecretRow).where(SecretRow.name == name).values(columns))
+        return secret
 
-    def _drawn(self, name: SecretName) -> dict[str, Any]:
-        sealed = self._keyring.seal(
-            os.urandom(SECRET_BYTES), purpose=SECRET_PURPOSE, bound_to=[name]
-        )
-        return {"wrapped_value": sealed, "wrapping_key": sealed_key_id(sealed)}
+    def _drawn(self, name: SecretName) -> tuple[bytes, dict[str, Any]]:
+        """A new secret, and the columns that it is kept in."""
+        secret = os.urandom(SECRET_BYTES)
+        sealed = self._keyring.seal(secret, purpose=SECRET_PURPOSE, bound_to=[name])
+        return secret, {"wrapped_value": sealed, "wrapping_key": sealed_key_id(sealed)}
 
     def __repr__(self) -> str:
         return "Secrets()"

@@ -430,6 +430,16 @@ def test_no_secret_is_made_anew_once_the_log_began(
     fresh.close()
 
 
+def test_a_chain_whose_head_and_another_secret_are_gone_does_not_begin_anew(
+    filled: TemplateStore, attacker: Callable[..., None]
+) -> None:
+    attacker("DELETE FROM audit_head", f"DELETE FROM secrets WHERE name = '{SecretName.LIFTS}'")
+    with pytest.raises(BrokenAuditLog, match=r"lifts.* backup"):
+        filled.upgrade()
+    with pytest.raises(BrokenAuditLog, match="head"):
+        filled.audit_log.head()
+
+
 # --- the archive ---------------------------------------------------------------------------
 
 
