@@ -11,7 +11,7 @@ every worker counts the same and a restart forgets nothing.
 """
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import timedelta
 from typing import Any, Protocol, TypeVar, cast
@@ -126,11 +126,12 @@ class Attempts:
         SealError
             If the row was altered or moved, or its master key is missing.
         """
+        parameters = self._parameters(tenant, subject_id, token=token, contract_id=contract_id)
         for _ in range(TRIES):
             with contextlib.suppress(Superseded, RetiredRotation):
-                attempt = self._read(tenant, subject_id, contract_id, token)
+                attempt = self._read(parameters)
                 decided = compare(attempt)
-                self._record(tenant, subject_id, attempt, decided, contract_id, token, by)
+                self._record(parameters, attempt, decided, by)
                 return decided
         raise StoreBusy("the subject's template changes again and again: send the probe again")
 
@@ -142,16 +143,16 @@ class Attempts:
         bool
             False if there was none of these. The total stays.
         """
-        pseudonym = self._context.signer.pseudonym(tenant, checked_subject_id(subject_id))
+        parameters = self._parameters(tenant, subject_id)
 
         def work(connection: Connection) -> bool:
-            row = self._standing(connection, tenant, subject_id, None)
+            row = _row_of(connection, RECORD_QUERY, parameters)
             status = self._status(row)
             lifts = status is not None and not status.is_clear
             if status is not None and lifts:
-                _write_counts(connection, row, pseudonym, status.cleared())
+                _write_counts(connection, row, parameters["pseudonym"], status.cleared())
             outcome = "reset" if lifts else "nothing_held"
-            entry = Entry("lockout-reset", outcome, by, tenant, pseudonym)
+            entry = Entry("lockout-reset", outcome, by, tenant, parameters["pseudonym"])
             self._context.audit_log.append(connection, entry)
             return lifts
 
@@ -159,9 +160,9 @@ class Attempts:
 
     def status(self, tenant: str, subject_id: str) -> AttemptsStatus | None:
         """What is counted of a subject; None if no attempt on it ever failed."""
-        checked_subject_id(subject_id)
+        parameters = self._parameters(tenant, subject_id)
         row = self._context.database.read(
-            lambda connection: self._standing(connection, tenant, subject_id, None)
+            lambda connection: _row_of(connection, RECORD_QUERY, parameters)
         )
         return self._status(row)
 
@@ -178,18 +179,14 @@ class Attempts:
         statement = sa.delete(FailedAttemptsRow).where(due)
         return database.write(lambda connection: connection.execute(statement).rowcount)
 
-    def _read(self, tenant: str, subject_id: str, contract_id: str, token: str | None) -> Attempt:
+    def _read(self, parameters: Mapping[str, Any]) -> Attempt:
         """Read all that a decision needs, and refuse early what :meth:`_record` would refuse.
 
         One query, and as many bytes, whether the subject is enrolled or not.
         """
-        parameters = self._parameters(tenant, subject_id, token)
-        parameters |= {"contract_id": contract_id, "place": parameters["pseudonym"][:32]}
         row = self._context.database.read(
-            lambda connection: connection.execute(DECISION_QUERY, parameters).one_or_none()
+            lambda connection: _row_of(connection, DECISION_QUERY, parameters)
         )
-        if row is None:
-            raise UnknownTenant.of_name(tenant)
         if row.is_used:
             raise Replayed
         self._policy.refuse_locked(self._status(row), self._context.clock())
@@ -199,23 +196,16 @@ class Attempts:
         return Attempt(rotation_epoch=row.current_epoch, template=template)
 
     def _record(
-        self,
-        tenant: str,
-        subject_id: str,
-        attempt: Attempt,
-        decided: Decided,
-        contract_id: str,
-        token: str | None,
-        by: By,
+        self, parameters: Mapping[str, Any], attempt: Attempt, decided: Decided, by: By
     ) -> None:
         template_id = None if attempt.template is None else attempt.template.template_id
         if decided.accepted and template_id is None:
             raise ValueError("a subject that is not enrolled cannot be accepted")
-        pseudonym = self._context.signer.pseudonym(tenant, subject_id)
+        pseudonym = parameters["pseudonym"]
 
         def work(connection: Connection) -> LockedOut | Replayed | None:
-            row, now = self._standing(connection, tenant, subject_id, token), self._context.clock()
-            status, spent = self._status(row), token
+            row, now = _row_of(connection, RECORD_QUERY, parameters), self._context.clock()
+            status, spent = self._status(row), parameters["token"]
             refusal: LockedOut | Replayed | None = None
             outcome = "accept" if decided.accepted else "reject"
             try:
@@ -227,19 +217,21 @@ class Attempts:
             except Replayed as error:
                 outcome, refusal, spent = "replayed", error, None
             else:
-                stored = row.template_id if row.contract_id == contract_id else None
+                stored = row.template_id if row.contract_id == parameters["contract_id"] else None
                 if stored != template_id:
                     raise Superseded
                 if not decided.accepted:
                     failed = (0, 0) if status is None else (status.consecutive, status.total)
-                    new = AttemptsStatus(failed[0] + 1, failed[1] + 1, now, None, None)
+                    new = self._policy.status(failed[0] + 1, failed[1] + 1, now)
                     _write_counts(connection, row, pseudonym, new)
                 else:
                     use = {"of_subject": row.subject_pk, "last_used_at": now}
                     connection.execute(_NOTE_USE, use)
                     if status is not None and not status.is_clear:
                         _write_counts(connection, row, pseudonym, status.cleared())
-            entry = Entry("verify", outcome, by, tenant, pseudonym, decided.level, spent)
+            entry = Entry(
+                "verify", outcome, by, parameters["tenant"], pseudonym, decided.level, spent
+            )
             self._context.audit_log.append(connection, entry)
             return refusal
 
@@ -247,28 +239,28 @@ class Attempts:
         if refusal is not None:
             raise refusal
 
-    def _standing(
-        self, connection: Connection, tenant: str, subject_id: str, token: str | None
-    ) -> Any:
-        """Row of :data:`RECORD_QUERY`; :class:`UnknownTenant` where there is none."""
-        parameters = self._parameters(tenant, subject_id, token)
-        row = connection.execute(RECORD_QUERY, parameters).one_or_none()
-        if row is None:
-            raise UnknownTenant.of_name(tenant)
-        return row
-
     def _status(self, row: Any) -> AttemptsStatus | None:
         if row.counted is None:
             return None
         return self._policy.status(row.consecutive, row.total, row.last_failed_at)
 
-    def _parameters(self, tenant: str, subject_id: str, token: str | None) -> dict[str, Any]:
+    def _parameters(
+        self,
+        tenant: str,
+        subject_id: str,
+        *,
+        token: str | None = None,
+        contract_id: str | None = None,
+    ) -> dict[str, Any]:
+        """Parameters of the queries."""
         pseudonym = self._context.signer.pseudonym(tenant, checked_subject_id(subject_id))
         return {
             "tenant": tenant,
             "subject_id": subject_id,
             "pseudonym": pseudonym,
+            "place": pseudonym[:32],
             "token": token,
+            "contract_id": contract_id,
         }
 
 
@@ -346,6 +338,14 @@ _NEXT_COUNTS = sa.update(_failures).where(
     _failures.c.pseudonym == sa.bindparam("of_pseudonym"),
 )
 _NOTE_USE = sa.update(_subjects).where(_subjects.c.id == sa.bindparam("of_subject"))
+
+
+def _row_of(connection: Connection, query: Any, parameters: Mapping[str, Any]) -> Any:
+    """The one row of a query; :class:`UnknownTenant` where there is none."""
+    row = connection.execute(query, parameters).one_or_none()
+    if row is None:
+        raise UnknownTenant.of_name(parameters["tenant"])
+    return row
 
 
 def _write_counts(connection: Connection, row: Any, pseudonym: str, status: AttemptsStatus) -> None:
