@@ -123,7 +123,7 @@ class Database:
             For a short time: every other write waits for it.
         wait
             Seconds to wait for other writes; the timeout by default, and 0 for as long as it takes
-            (on SQLite the timeout).
+            (on SQLite, and for the threads of this process, the timeout).
 
         Raises
         ------
@@ -133,18 +133,19 @@ class Database:
             As of :meth:`read`. Nothing was written.
         """
         process = self._process()
-        longest = self._timeout if wait is None else wait
-        until = time.monotonic() + (longest or self._timeout)
+        wait = self._timeout if wait is None else wait
+        patience = wait or self._timeout
+        until = time.monotonic() + patience
         # Threads queue here in turn: SQLite's own lock is polled and knows no order, and on
         # PostgreSQL each that waits would hold a connection that readers need.
-        turn = process.turn_to_write(longest or None)
+        turn = process.turn_to_write(patience)
         with _translating(), turn, process.engine.begin() as connection:
             if self.is_sqlite:
                 with self._turn(until), self._patience(connection, until) as driver:
                     driver.execute("BEGIN IMMEDIATE")
                 process.require_file()
             else:
-                connection.execute(_BEGIN_WRITE, {"limit": str(round(1000 * longest))})
+                connection.execute(_BEGIN_WRITE, {"limit": str(round(1000 * wait))})
             return work(connection)
 
     def purge_log(self) -> bool:
@@ -159,7 +160,7 @@ class Database:
         process = self._process()
         with (
             contextlib.suppress(*_DATABASE_ERRORS, StoreError),
-            process.turn_to_write(),
+            process.turn_to_write(self._timeout),
             self._turn(time.monotonic() + PURGE_WAIT_S),
             process.engine.connect() as connection,
             self._patience(connection, time.monotonic() + PURGE_WAIT_S) as driver,
@@ -174,7 +175,7 @@ class Database:
         autocommit = process.engine.execution_options(isolation_level="AUTOCOMMIT")
         with (
             _translating(),
-            process.turn_to_write(),
+            process.turn_to_write(self._timeout),
             self._turn(time.monotonic() + self._timeout),
             autocommit.connect() as connection,
         ):
@@ -226,7 +227,7 @@ class Database:
             pool_size=self._pool_size,
             max_overflow=self._max_overflow,
         )
-        return _Process(engine, self._file, self._timeout)
+        return _Process(engine, self._file)
 
     def __repr__(self) -> str:
         return f"Database({self.url.render_as_string(hide_password=True)!r})"
@@ -235,7 +236,7 @@ class Database:
 class _Process:
     """What belongs to one process: its engine, and that seen as readers'."""
 
-    def __init__(self, engine: Engine, file: Path | None, timeout: float) -> None:
+    def __init__(self, engine: Engine, file: Path | None) -> None:
         self.pid = os.getpid()
         self.engine = engine
         self._file = file
@@ -244,7 +245,6 @@ class _Process:
             # SQLite would make an empty file, and the connection would stay with that one.
             sa.event.listen(engine, "do_connect", lambda *_: self.require_file())
         self._writing = threading.Lock()
-        self._timeout = timeout
         self.readers = (
             engine
             if engine.dialect.name == "sqlite"
@@ -252,9 +252,9 @@ class _Process:
         )
 
     @contextlib.contextmanager
-    def turn_to_write(self, timeout: float | None = None) -> Iterator[None]:
+    def turn_to_write(self, timeout: float) -> Iterator[None]:
         """Hold the turn among the threads of this process; StoreBusy where it does not come."""
-        if not self._writing.acquire(timeout=timeout or self._timeout):
+        if not self._writing.acquire(timeout=timeout):
             raise StoreBusy("other writes of this process take too long")
         try:
             yield
