@@ -18,6 +18,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import partial
 from typing import Any
 
 import sqlalchemy as sa
@@ -96,10 +97,14 @@ class Head:
     base: Anchor
     last: Anchor
 
+    @property
+    def ends(self) -> tuple[int, bytes, int, bytes]:
+        """Columns of the head row, without its MAC."""
+        return self.base.sequence, self.base.mac, self.last.sequence, self.last.mac
+
     def mac(self, key: bytes) -> bytes:
         """MAC of the head row."""
-        ends = (self.base.sequence, self.base.mac, self.last.sequence, self.last.mac)
-        return hmac.digest(key, encode_parts("head", *ends), hashlib.sha256)
+        return hmac.digest(key, encode_parts("head", *self.ends), hashlib.sha256)
 
 
 @dataclass(frozen=True)
@@ -357,7 +362,7 @@ class AuditLog:
 
     def lines(self, *, after: int = 0, batch: int = BATCH) -> Iterator[Line]:
         """Lines in their order, beginning after one; read in batches, and not verified."""
-        while rows := self._read(after, batch):
+        while rows := self._database.read(partial(_rows_after, after=after, most=batch)):
             yield from map(_line, rows)
             after = rows[-1].sequence
 
@@ -433,7 +438,8 @@ class AuditLog:
             head, rows = self._database.read(
                 lambda connection, after=last.sequence: (  # type: ignore[misc]
                     read_head(connection, key),
-                    _first_lines(connection, base, after, batch),
+                    # From the very first row: one that was slipped in before the base is seen too.
+                    _rows_after(connection, None if after == base.sequence else after, batch),
                 )
             )
             if head.base != base:
@@ -461,17 +467,11 @@ class AuditLog:
 
     def lines_after(self, connection: Connection, last: Anchor) -> Iterator[Mapping[str, Any]]:
         """Columns of the lines after the last one of a walk, up to the first break."""
-        query = LINES.where(AuditRow.sequence > last.sequence).order_by(AuditRow.sequence)
-        rows: Any = connection.execute(query).all()
-        for row in rows:
+        for row in _rows_after(connection, last.sequence):
             if line_break(self.key, row._mapping, last):
                 return
             last = Anchor(row.sequence, row.mac)
             yield row._mapping
-
-    def _read(self, after: int, batch: int) -> Sequence[Any]:
-        query = LINES.where(AuditRow.sequence > after).order_by(AuditRow.sequence).limit(batch)
-        return self._database.read(lambda connection: connection.execute(query).all())
 
     def __repr__(self) -> str:
         return "AuditLog()"
@@ -523,14 +523,15 @@ def read_head(connection: Connection, key: bytes) -> Head:
 
 def head_columns(head: Head, key: bytes) -> dict[str, Any]:
     """Columns of the head row."""
-    ends = (head.base.sequence, head.base.mac, head.last.sequence, head.last.mac)
-    return {**dict(zip(_HEAD, ends, strict=True)), "mac": head.mac(key)}
+    return {**dict(zip(_HEAD, head.ends, strict=True)), "mac": head.mac(key)}
 
 
-def _first_lines(connection: Connection, base: Anchor, after: int, batch: int) -> Sequence[Any]:
-    # From the very first row: a line that was slipped in before the base must be seen too.
-    query = LINES.order_by(AuditRow.sequence).limit(batch)
-    if after > base.sequence:
+def _rows_after(
+    connection: Connection, after: int | None, most: int | None = None
+) -> Sequence[Any]:
+    """Lines in their order, after the number of one, or from the very first row."""
+    query = LINES.order_by(AuditRow.sequence).limit(most)
+    if after is not None:
         query = query.where(AuditRow.sequence > after)
     return connection.execute(query).all()
 

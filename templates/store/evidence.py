@@ -18,7 +18,6 @@ from templates.store.attempts import COUNT_RETENTION
 from templates.store.audit_log import (
     TENANT_ERASE,
     Anchor,
-    AuditLog,
     Verification,
     template_digest,
 )
@@ -33,7 +32,7 @@ TENANT_ALTERED = "a setting of a tenant was changed"
 COUNT_LIFTED = "a count of failed attempts was lowered or removed"
 
 # Named, because a refused call leaves a line too, with the same action and its error code.
-_REMOVES_COUNT = {("erase", "erased"), ("erase", "nothing_held"), ("erase", "receipt_repeated")}
+_ERASES = {("erase", "erased"), ("erase", "nothing_held"), ("erase", "receipt_repeated")}
 _ENDS_FAILURES = {("verify", "accept"), ("lockout-reset", "reset")}
 # An hour of slack for clocks that differ.
 _FORGOTTEN_AFTER = COUNT_RETENTION - timedelta(hours=1)
@@ -88,7 +87,7 @@ class LogFindings:
                 del self.failures[each]
         elif action in ("enroll", "import") and outcome in ("created", "replaced"):
             self.templates[pseudonym] = detail
-        elif (action, outcome) in _REMOVES_COUNT:
+        elif (action, outcome) in _ERASES:
             self.failures.pop(pseudonym, None)
             self.templates[pseudonym] = None
         elif action == "verify" and outcome == "reject":
@@ -125,14 +124,13 @@ def verify_log_and_records(
     lines in an archive tell is not known.
     """
     findings = LogFindings()
-    log: AuditLog = context.audit_log
-    verification = log.verify(anchor=anchor, seen=findings.read, progress=progress)
+    verification = context.audit_log.verify(anchor=anchor, seen=findings.read, progress=progress)
     if not verification.intact:
         return verification, ()
 
     def work(connection: Connection) -> tuple[RecordProblem, ...]:
         # Lines and rows of one moment.
-        for line in log.lines_after(connection, verification.head):
+        for line in context.audit_log.lines_after(connection, verification.head):
             findings.read(line)
         return (
             *_keys(findings, api_keys, connection),
