@@ -19,7 +19,8 @@ from api.process.opening import checked_store
 from api.settings import Settings
 from templates.store import TemplateStore
 from templates.store.audit_archive import Archive, verify_archive
-from templates.store.audit_log import Anchor, AuditLog, BrokenAuditLog, Line
+from templates.store.audit_chain import Anchor, BrokenAuditLog
+from templates.store.audit_log import AuditLog, Line
 from templates.store.identifiers import InvalidIdentifier
 
 PROBLEMS_SHOWN = 20

@@ -6,7 +6,8 @@ Everything that a secret could be read from is encrypted; see ``docs/storage.md`
 from templates.store.api_keys import ApiKey, Right
 from templates.store.attempts import Attempt
 from templates.store.audit_archive import Archive, verify_archive
-from templates.store.audit_log import Anchor, BrokenAuditLog, By, Entry, Line
+from templates.store.audit_chain import Anchor, BrokenAuditLog
+from templates.store.audit_log import By, Entry, Line
 from templates.store.identifiers import InvalidIdentifier, UnknownTenant
 from templates.store.lockout import AttemptsStatus, LockedOut, LockoutPolicy, Replayed
 from templates.store.receipts import Receipt, verify_receipt

@@ -27,18 +27,16 @@ from sqlalchemy.engine import Connection
 from templates.contract.canonical import canonical_json
 from templates.errors import StoreError
 from templates.keys.private_file import create_private
-from templates.store.audit_log import (
+from templates.store.audit_chain import (
     LINES,
-    MOVE_HEAD,
     Anchor,
     BrokenAuditLog,
-    By,
-    Entry,
     Head,
-    head_columns,
     line_break,
+    move_head,
     read_head,
 )
+from templates.store.audit_log import By, Entry
 from templates.store.context import StoreContext
 from templates.store.schema import AuditRow
 from templates.store.secrets import SecretName
@@ -145,7 +143,7 @@ def write_archive(
     except OSError as error:
         raise StoreError(f"the archive {file} cannot be written: {error.strerror}") from None
     connection.execute(sa.delete(AuditRow).where(AuditRow.sequence <= last.sequence))
-    connection.execute(MOVE_HEAD, head_columns(Head(last, head.last), key))
+    move_head(connection, key, Head(last, head.last))
     return Archive(head.base, last, len(texts))
 
 

@@ -2,20 +2,15 @@
 
 A line names the subject by its pseudonym, and holds nothing of a face. It is written in the
 transaction of what it tells of: what is committed has its line, and what is rolled back has none.
-
-The lines are a chain: the MAC of a line is an HMAC-SHA256, under a secret of the deployment, over
-its columns and the MAC of the line before. The head row holds both ends of the chain under a MAC.
-So an attacker who can write the database, but has no master key, can neither write a line nor cut
-lines off unseen. An older state of the whole database, head included, is a true one: only an
-:class:`Anchor` that was kept elsewhere shows it.
+The lines are a chain (``templates.store.audit_chain``): nobody without the master key can alter one
+or cut lines off unseen.
 
 A one-use token is used up by the line of its use (``AuditRow.token``).
 """
 
 import hashlib
-import hmac
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import partial
@@ -26,6 +21,16 @@ from sqlalchemy.engine import Connection
 
 from templates.errors import StoreBusy, StoreError
 from templates.keys.sealing import encode_parts
+from templates.store.audit_chain import (
+    LINES,
+    START,
+    Anchor,
+    BrokenAuditLog,
+    append_line,
+    line_break,
+    read_head,
+    rows_after,
+)
 from templates.store.database import Database
 from templates.store.identifiers import (
     Clock,
@@ -34,17 +39,14 @@ from templates.store.identifiers import (
     checked_tenant_name,
 )
 from templates.store.lockout import Replayed
-from templates.store.schema import AuditHeadRow, AuditRow
+from templates.store.schema import AuditRow
 from templates.store.secrets import SecretName, Secrets
 
 BATCH = 1000
 MAX_TEXT = 64
 TENANT_ERASE = "tenant-erase"
 
-_ANCHOR = re.compile(r"([0-9]{1,18}):([0-9a-f]{64})")
 _DIGEST = re.compile(r"[0-9a-f]{64}")
-_COLUMNS = tuple(column.key for column in AuditRow.__table__.columns)
-_HEAD = ("base_sequence", "base_mac", "sequence", "line_mac")
 
 
 def _check_text(text: str | None, what: str) -> None:
@@ -52,59 +54,6 @@ def _check_text(text: str | None, what: str) -> None:
         raise InvalidIdentifier(
             f"the {what} of an audit line is 1 to {MAX_TEXT} printable characters"
         )
-
-
-class BrokenAuditLog(StoreError):
-    """The head of the audit log is missing or forged, so no line can be added."""
-
-
-@dataclass(frozen=True)
-class Anchor:
-    """A point of the chain, kept outside the database: the chain must still lead through it.
-
-    Attributes
-    ----------
-    sequence
-        Number of a line; 0 is before the first.
-    mac
-        The 32 bytes of its MAC.
-    """
-
-    sequence: int
-    mac: bytes = field(repr=False)
-
-    def __str__(self) -> str:
-        return f"{self.sequence}:{self.mac.hex()}"
-
-    @classmethod
-    def parse(cls, text: str) -> "Anchor":
-        """Read what ``str`` wrote, or raise :class:`InvalidIdentifier`."""
-        match = _ANCHOR.fullmatch(text)
-        if match is None:
-            raise InvalidIdentifier(
-                "an anchor is a line's number, a colon and 64 hexadecimal digits"
-            )
-        return cls(int(match[1]), bytes.fromhex(match[2]))
-
-
-START = Anchor(0, bytes(32))
-
-
-@dataclass(frozen=True)
-class Head:
-    """Both ends of the chain: it begins after `base` and ends with `last`."""
-
-    base: Anchor
-    last: Anchor
-
-    @property
-    def ends(self) -> tuple[int, bytes, int, bytes]:
-        """Columns of the head row, without its MAC."""
-        return self.base.sequence, self.base.mac, self.last.sequence, self.last.mac
-
-    def mac(self, key: bytes) -> bytes:
-        """MAC of the head row."""
-        return hmac.digest(key, encode_parts("head", *self.ends), hashlib.sha256)
 
 
 @dataclass(frozen=True)
@@ -250,33 +199,6 @@ def template_digest(template_id: str) -> str:
     return hashlib.sha256(encode_parts("template", template_id)).hexdigest()
 
 
-def line_mac(key: bytes, values: Mapping[str, Any], previous: bytes) -> bytes:
-    """MAC of a line.
-
-    Parameters
-    ----------
-    key
-        Secret of the chain, 32 bytes.
-    values
-        The columns of ``audit_log`` by name; ``mac`` is not looked at.
-    previous
-        MAC of the line before.
-
-    Raises
-    ------
-    TypeError
-        If a column holds what this program never writes.
-    """
-    parts: list[str | int] = []
-    for name in _COLUMNS[:-1]:
-        value = values[name]
-        # No column that may be NULL holds a number, so 0 cannot be taken for one.
-        if value is not None and type(value) not in (str, int):
-            raise TypeError(f"{name} holds a {type(value).__name__}")
-        parts.append(0 if value is None else value)
-    return hmac.digest(key, encode_parts("line", previous, *parts), hashlib.sha256)
-
-
 class AuditLog:
     """The audit log of a deployment.
 
@@ -296,12 +218,6 @@ class AuditLog:
         """The secret of the chain."""
         return self._secrets.get(SecretName.CHAIN)
 
-    def begin(self, connection: Connection, key: bytes, base: Anchor = START) -> None:
-        """Begin a chain under a new key, in a write; a head that is there already is replaced."""
-        head = Head(base, base)
-        connection.execute(sa.delete(AuditHeadRow))
-        connection.execute(sa.insert(AuditHeadRow).values(id=1, **head_columns(head, key)))
-
     def append(self, connection: Connection, entry: Entry, *, key: bytes | None = None) -> None:
         """Add a line inside a write, under the secret of the chain or the one that it begins with.
 
@@ -310,11 +226,8 @@ class AuditLog:
         BrokenAuditLog
             If the head row is missing or forged. Adding to it would hide that.
         """
-        key = key or self.key
-        head = read_head(connection, key)
         at = self._clock().astimezone(UTC).isoformat(timespec="microseconds")
-        values: dict[str, Any] = {
-            "sequence": head.last.sequence + 1,
+        columns = {
             "at": at,
             "tenant": entry.tenant,
             "actor": entry.by.actor,
@@ -325,10 +238,7 @@ class AuditLog:
             "detail": entry.detail,
             "token": entry.token,
         }
-        values["mac"] = line_mac(key, values, head.last.mac)
-        connection.execute(_ADD_LINE, values)
-        moved = Head(head.base, Anchor(values["sequence"], values["mac"]))
-        connection.execute(MOVE_HEAD, head_columns(moved, key))
+        append_line(connection, key or self.key, columns)
 
     def record(self, entry: Entry) -> None:
         """Add a line in a transaction of its own."""
@@ -362,7 +272,7 @@ class AuditLog:
 
     def lines(self, *, after: int = 0, batch: int = BATCH) -> Iterator[Line]:
         """Lines in their order, beginning after one; read in batches, and not verified."""
-        while rows := self._database.read(partial(_rows_after, after=after, most=batch)):
+        while rows := self._database.read(partial(rows_after, after=after, most=batch)):
             yield from map(_line, rows)
             after = rows[-1].sequence
 
@@ -439,7 +349,7 @@ class AuditLog:
                 lambda connection, after=last.sequence: (  # type: ignore[misc]
                     read_head(connection, key),
                     # From the very first row: one that was slipped in before the base is seen too.
-                    _rows_after(connection, None if after == base.sequence else after, batch),
+                    rows_after(connection, None if after == base.sequence else after, batch),
                 )
             )
             if head.base != base:
@@ -467,7 +377,7 @@ class AuditLog:
 
     def lines_after(self, connection: Connection, last: Anchor) -> Iterator[Mapping[str, Any]]:
         """Columns of the lines after the last one of a walk, up to the first break."""
-        for row in _rows_after(connection, last.sequence):
+        for row in rows_after(connection, last.sequence):
             if line_break(self.key, row._mapping, last):
                 return
             last = Anchor(row.sequence, row.mac)
@@ -477,76 +387,10 @@ class AuditLog:
         return "AuditLog()"
 
 
-# Made once: building a statement costs more than running it, and every write appends a line.
-_ADD_LINE = sa.insert(AuditRow.__table__)  # type: ignore[arg-type]
-MOVE_HEAD = sa.update(AuditHeadRow.__table__)  # type: ignore[arg-type]
-# The MAC as it is: SQLite keeps any value in any column, and an altered one must still arrive.
-LINES: Any = sa.select(
-    *(getattr(AuditRow, name) for name in _COLUMNS[:-1]),
-    sa.type_coerce(AuditRow.mac, sa.types.NullType()).label("mac"),
-)
-_HEADS: Any = sa.select(
-    *(
-        sa.type_coerce(getattr(AuditHeadRow, name), sa.types.NullType()).label(name)
-        for name in (*_HEAD, "mac")
-    )
-)
-
-
 def is_used(connection: Connection, token: str) -> bool:
     """Whether a one-use token has a line that used it up."""
     query = sa.select(AuditRow.sequence).where(AuditRow.token == token)
     return connection.execute(query).first() is not None
-
-
-def read_head(connection: Connection, key: bytes) -> Head:
-    """Read both ends of the chain.
-
-    Raises
-    ------
-    BrokenAuditLog
-        If the row is missing or forged.
-    """
-    rows = connection.execute(_HEADS).all()
-    if len(rows) == 1:
-        row = rows[0]
-        with_types = [type(value) for value in row]
-        if with_types == [int, bytes, int, bytes, bytes]:
-            head = Head(Anchor(row.base_sequence, row.base_mac), Anchor(row.sequence, row.line_mac))
-            if hmac.compare_digest(head.mac(key), row.mac):
-                return head
-    raise BrokenAuditLog(
-        "the head of the audit log is missing or was altered: "
-        "run `veilface audit-log verify`, and restore the database from a backup"
-    )
-
-
-def head_columns(head: Head, key: bytes) -> dict[str, Any]:
-    """Columns of the head row."""
-    return {**dict(zip(_HEAD, head.ends, strict=True)), "mac": head.mac(key)}
-
-
-def _rows_after(
-    connection: Connection, after: int | None, most: int | None = None
-) -> Sequence[Any]:
-    """Lines in their order, after the number of one, or from the very first row."""
-    query = LINES.order_by(AuditRow.sequence).limit(most)
-    if after is not None:
-        query = query.where(AuditRow.sequence > after)
-    return connection.execute(query).all()
-
-
-def line_break(key: bytes, values: Mapping[str, Any], last: Anchor) -> str | None:
-    """Say why a line does not follow; None where it does."""
-    if values["sequence"] != last.sequence + 1:
-        return "missing" if values["sequence"] > last.sequence else "out of order"
-    try:
-        expected = line_mac(key, values, last.mac)
-    except TypeError:
-        return "altered"
-    mac = values["mac"]
-    is_true = isinstance(mac, bytes) and hmac.compare_digest(expected, mac)
-    return None if is_true else "altered"
 
 
 def _line(row: Any) -> Line:

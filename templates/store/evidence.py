@@ -15,12 +15,8 @@ from sqlalchemy.engine import Connection
 from templates.errors import StoreError
 from templates.store.api_keys import ApiKey, ApiKeys
 from templates.store.attempts import COUNT_RETENTION
-from templates.store.audit_log import (
-    TENANT_ERASE,
-    Anchor,
-    Verification,
-    template_digest,
-)
+from templates.store.audit_chain import Anchor
+from templates.store.audit_log import TENANT_ERASE, Verification, template_digest
 from templates.store.context import StoreContext
 from templates.store.schema import FailedAttemptsRow, SubjectRow, TemplateRow, TenantRow
 

@@ -14,6 +14,7 @@ from sqlalchemy.engine import Connection
 
 from templates.store.api_keys import ApiKeys
 from templates.store.audit_archive import Archive, write_archive
+from templates.store.audit_chain import begin_chain
 from templates.store.audit_log import By, Entry
 from templates.store.context import StoreContext
 from templates.store.receipts import sign_again
@@ -70,7 +71,7 @@ def renew_secrets(context: StoreContext, api_keys: ApiKeys, archive: Path, *, by
         refused = api_keys.authenticate_again(connection, fresh[SecretName.API_KEYS])
         receipts = sign_again(connection, old_receipt_key, fresh[SecretName.RECEIPT])
         key = fresh[SecretName.CHAIN]
-        context.audit_log.begin(connection, key, base=archived.last)
+        begin_chain(connection, key, archived.last)
         context.audit_log.append(connection, Entry("secrets-renew", "renewed", by), key=key)
         return Renewed(archived, receipts, refused)
 

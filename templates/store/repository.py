@@ -12,7 +12,8 @@ from templates.store import migrate
 from templates.store.api_keys import ApiKeys
 from templates.store.attempts import Attempts
 from templates.store.audit_archive import Archive, archive_lines
-from templates.store.audit_log import PROGRAM, Anchor, BrokenAuditLog, By, Verification
+from templates.store.audit_chain import Anchor, BrokenAuditLog, begin_chain
+from templates.store.audit_log import PROGRAM, By, Verification
 from templates.store.context import StoreContext
 from templates.store.database import Database
 from templates.store.erasure import Erasures
@@ -105,7 +106,7 @@ class TemplateStore:
                 f"secrets of the deployment are missing ({', '.join(sorted(made))}): "
                 "restore the database from a backup"
             )
-        self.audit_log.begin(connection, made[SecretName.CHAIN])
+        begin_chain(connection, made[SecretName.CHAIN])
 
     def check(self) -> None:
         """Raise, naming the remedy, unless schema and master key are the right ones."""

@@ -23,7 +23,8 @@ from templates.keys.sealing import MasterKeyring
 from templates.space.subspace import SubspaceBatch
 from templates.store import TemplateStore
 from templates.store.audit_archive import verify_archive
-from templates.store.audit_log import Anchor, Head, Line, head_columns, line_mac
+from templates.store.audit_chain import Anchor, Head, head_columns, line_mac
+from templates.store.audit_log import Line
 from templates.store.database import Database
 from templates.store.receipts import sign_claims
 from templates.store.schema import ApiKeyRow, AuditHeadRow, AuditRow

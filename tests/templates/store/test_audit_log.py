@@ -26,7 +26,8 @@ from templates.store import (
     UnknownTenant,
     verify_archive,
 )
-from templates.store.audit_log import START, template_digest, token_digest
+from templates.store.audit_chain import START
+from templates.store.audit_log import template_digest, token_digest
 from templates.store.database import Database
 from templates.store.schema import AuditRow, SubjectRow
 from templates.store.secrets import SecretName
