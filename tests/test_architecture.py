@@ -66,7 +66,7 @@ def test_commands_write_no_file_where_a_link_of_somebody_else_leads() -> None:
         for path in (ROOT / folder).rglob("*.py")
     ]
     writing = re.compile(
-        r"""\.write_(text|bytes)\(|\.mkdir\(|savefig\((?!png|svg)|open\([^)]*["'][wxa]b?["']"""
+        r"""\.write_(text|bytes)\(|savefig\((?!png|svg)|open\([^)]*["'][wxa]b?["']"""
     )
     wrong = {
         str(path.relative_to(ROOT)): lines
