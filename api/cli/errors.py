@@ -20,7 +20,7 @@ USAGE = 2
 NO_DECISION = 3
 _FAILED_STATUS = {"verify": NO_DECISION}  # where 1 is an answer
 EXTRAS = {
-    "evaluate": ("matplotlib", "numba"),
+    "evaluate": ("matplotlib", "numba", "pandas"),
     "audit": ("matplotlib", "sklearn"),
     "cluster": ("distributed",),
     "postgres": ("psycopg",),
