@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from api.process.opening import file_sealer, open_keyring
+from api.service.opening import file_sealer, open_keyring
 from api.settings import load_settings
 from attacks.impostor_presentations import verify_presentations
 from models.decoding import decode_image

@@ -26,7 +26,7 @@ import httpx
 import numpy as np
 import numpy.typing as npt
 
-from api.process.runtime import Runtime
+from api.service.runtime import Runtime
 from api.settings import load_settings
 from benchmarks.deployment import service, veilface
 from benchmarks.end_to_end import (

@@ -14,7 +14,7 @@ import psycopg
 import pytest
 from sqlalchemy.engine import make_url
 
-from api.process.opening import open_keyring, open_store
+from api.service.opening import open_keyring, open_store
 from api.settings import Settings
 from tests.api.cli.conftest import Ran, run
 from tests.api.deployment import deploy, environment_of, photo

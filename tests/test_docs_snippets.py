@@ -25,7 +25,7 @@ import yaml
 
 from api.cli.app import COMMANDS, app, load
 from api.http.receipts import receipt_key_json
-from api.process.opening import open_keyring, open_store
+from api.service.opening import open_keyring, open_store
 from api.settings import Settings
 from models.pack_file import read_pack_file
 from templates.store import By
@@ -165,7 +165,7 @@ PARSED = {
     ("docs/measurements.md", "veilface decoys build fairface/train --pack $PACK --kind pool "
      "--out pool.veil"): OWN_DATA,
     ("docs/operations.md", "veilface serve --host 0.0.0.0 --tls-certificate chain.pem "
-     "--tls-key key.pem"): "tests/api/process/test_operations.py starts a service with TLS",
+     "--tls-key key.pem"): "tests/api/service/test_operations.py starts a service with TLS",
     ("docs/privacy.md", "python -m benchmarks.operating_point --data ../shared/data"): OWN_DATA,
 }  # fmt: skip
 # Blocks that nothing executes, and why. docs/README.md names these pages.

@@ -12,8 +12,8 @@ from api.cli.descriptors import BULK, Aligned, Cache, Flip, bulk_pack, extract
 from api.cli.errors import UsageError, require_extra
 from api.cli.inputs import fairface_labels, listed_dims, listed_names, load_decoys
 from api.cli.options import PROCESSOR, AsJson, Device, chosen_device, quick, takes_settings
-from api.process.opening import file_sealer, open_keyring
 from api.process.preparation import DEFAULT_DIM, acquired_json
+from api.service.opening import file_sealer, open_keyring
 from api.settings import Settings
 from attacks.attributes.attackers import TRAINED
 from attacks.attributes.audit import (

@@ -15,7 +15,7 @@ from api.cli.options import STORE, AsJson, takes_settings
 from api.cli.public_key import PublicKey, read_public_key
 from api.http.audit import operator
 from api.http.values import iso_time
-from api.process.opening import checked_store
+from api.service.opening import checked_store
 from api.settings import Settings
 from templates.store import TemplateStore
 from templates.store.audit_archive import Archive, verify_archive

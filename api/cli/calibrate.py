@@ -17,7 +17,6 @@ from api.cli.inputs import fairface_labels, load_decoys
 from api.cli.options import AsJson, takes_settings
 from api.cli.photo_folders import people_or_faces
 from api.cli.verdict import improvements, shown_rate, verdict_lines
-from api.process.opening import file_sealer, open_keyring
 from api.process.preparation import (
     DEFAULT_PROBE_DIM,
     acquired,
@@ -25,6 +24,7 @@ from api.process.preparation import (
     calibrate_folder,
     default_probe_dims,
 )
+from api.service.opening import file_sealer, open_keyring
 from api.settings import Settings
 from templates.contract.binding import MAX_M
 from templates.contract.document import Calibration, Contract

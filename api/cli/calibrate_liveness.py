@@ -8,7 +8,7 @@ from api.cli.descriptors import bulk_pack
 from api.cli.errors import CommandError, UsageError
 from api.cli.evaluate_liveness import require_liveness, score_with_progress
 from api.cli.verdict import shown_rate
-from api.process.opening import file_sealer, open_keyring
+from api.service.opening import file_sealer, open_keyring
 from api.settings import Settings
 from models.errors import PackError
 from models.pack import ModelPack

@@ -11,7 +11,7 @@ from api.cli.errors import UsageError
 from api.cli.options import STORE, AsJson, Tenant, takes_settings
 from api.http.audit import operator
 from api.http.receipts import receipt_json
-from api.process.opening import checked_store, open_keyring, open_store, retention_of
+from api.service.opening import checked_store, open_keyring, open_store, retention_of
 from api.settings import Settings
 from templates.errors import VeilfaceError
 from templates.keys.private_file import replace_private

@@ -15,7 +15,6 @@ from api.cli.errors import CommandError, UsageError
 from api.cli.files import is_left_out, read_names
 from api.cli.options import AsJson, takes_settings
 from api.cli.photo_folders import find_photos
-from api.process.opening import file_sealer, open_keyring
 from api.process.preparation import (
     LikeSample,
     acquired,
@@ -23,6 +22,7 @@ from api.process.preparation import (
     make_generator,
     make_pool,
 )
+from api.service.opening import file_sealer, open_keyring
 from api.settings import Settings
 from models.extraction import Extraction
 from templates.decoys import Attributes, DecoyGenerator

@@ -8,8 +8,8 @@ import typer
 
 from api.cli.console import message
 from api.cli.errors import CommandError, UsageError
-from api.process.opening import file_sealer, open_keyring
 from api.process.preparation import acquired, without_lookalikes
+from api.service.opening import file_sealer, open_keyring
 from api.settings import Settings
 from models.cache import EmbeddingCache
 from models.extraction import Extraction, Extractor

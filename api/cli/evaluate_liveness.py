@@ -12,8 +12,8 @@ from api.cli.errors import CommandError, UsageError, require_extra
 from api.cli.html_report import write_html
 from api.cli.inputs import listed, load_decoys
 from api.cli.options import AsJson, takes_settings
-from api.process.opening import file_sealer, open_keyring
 from api.process.preparation import recorded_of
+from api.service.opening import file_sealer, open_keyring
 from api.settings import Settings
 from attacks.impostor_presentations import verify_presentations
 from models.liveness import PassiveLiveness

@@ -7,8 +7,8 @@ from pathlib import Path
 from api.cli.console import message
 from api.cli.descriptors import bulk_pack
 from api.cli.errors import CommandError, UsageError
-from api.process.opening import file_sealer, open_keyring
 from api.process.preparation import recorded_of, require_made_with
+from api.service.opening import file_sealer, open_keyring
 from api.settings import Settings
 from models.sessions import default_workers
 from templates.decoys import DecoyGenerator, DecoyPool, load_source

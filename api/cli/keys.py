@@ -16,7 +16,7 @@ from api.cli.options import STORE, AsJson, Tenant, takes_settings
 from api.cli.public_key import PublicKey, read_public_key
 from api.http.audit import operator
 from api.http.receipts import verify_answer
-from api.process.opening import open_contract, open_keyring
+from api.service.opening import open_contract, open_keyring
 from api.settings import Settings
 from templates.contract.canonical import parse_object
 from templates.errors import StoreError

@@ -11,7 +11,7 @@ import typer
 from api.cli.console import emit, progress, say
 from api.cli.errors import CommandError, UsageError
 from api.cli.options import STORE, AsJson, takes_settings
-from api.process.opening import file_sealer, open_keyring, open_store, prepare_database
+from api.service.opening import file_sealer, open_keyring, open_store, prepare_database
 from api.settings import Settings
 from templates.contract.document import Contract
 from templates.decoys import DecoyPool, load_source

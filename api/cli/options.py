@@ -15,7 +15,7 @@ import typer
 from pydantic.fields import FieldInfo
 
 from api.cli.errors import UsageError
-from api.process.environment import variables_set
+from api.service.environment import variables_set
 from api.settings import CONFIG_VARIABLE, ENV_PREFIX, Settings, load_settings
 from templates.errors import TemplateError
 

@@ -17,7 +17,7 @@ from api.cli.master_keys import (
 )
 from api.cli.options import AsJson, takes_settings
 from api.http.audit import operator
-from api.process.opening import open_keyring
+from api.service.opening import open_keyring
 from api.settings import Settings
 from templates.store.identifiers import utc_now
 

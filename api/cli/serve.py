@@ -16,11 +16,11 @@ from api.cli.new_key import show_once
 from api.cli.options import takes_settings
 from api.cli.verdict import private_mode_weakness, verdict_lines
 from api.limits.rates import RateLimits
-from api.process.metrics import shared_directory
-from api.process.opening import key_beside_database, require_privacy
-from api.process.operations import tls_options
-from api.process.runtime import Runtime
-from api.process.supervisor import run_server
+from api.service.metrics import shared_directory
+from api.service.opening import key_beside_database, require_privacy
+from api.service.operations import tls_options
+from api.service.runtime import Runtime
+from api.service.supervisor import run_server
 from api.settings import Settings
 from models.sessions import resolve_providers
 from templates.contract.document import Contract

@@ -28,7 +28,6 @@ from api.cli.setup_files import (
     write_settings,
 )
 from api.cli.verdict import verdict_lines
-from api.process.opening import file_sealer, open_contract, open_keyring, weak_privacy
 from api.process.preparation import (
     CalibratedFolder,
     acquired,
@@ -44,6 +43,7 @@ from api.process.roles import (
     split_people,
     with_several,
 )
+from api.service.opening import file_sealer, open_contract, open_keyring, weak_privacy
 from api.settings import DEFAULT_CONFIG_FILE, Settings, config_file
 from models.extraction import Extraction
 from models.pack import ModelPack

@@ -7,7 +7,7 @@ from typing import Any
 from api.cli.console import message
 from api.cli.master_keys import is_from_file, opened_store
 from api.http.audit import operator
-from api.process.settings_file import settings_text
+from api.service.settings_file import settings_text
 from api.settings import DEFAULT_CONFIG_FILE, Settings, config_file, load_settings
 from templates.keys.private_file import create_private, replace_private, replace_public
 from templates.keys.sealing import MasterKeyring

@@ -13,8 +13,8 @@ from api.cli.files import read_photo
 from api.cli.options import LOCAL, AsJson, Tenant, takes_settings
 from api.http.audit import operator
 from api.http.errors import ApiError
-from api.process.opening import weak_privacy
-from api.process.runtime import Runtime
+from api.service.opening import weak_privacy
+from api.service.runtime import Runtime
 from api.settings import Settings
 from enroll.enroller import MAX_PHOTOS, Holder
 from models.errors import PhotoRejected

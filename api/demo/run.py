@@ -26,9 +26,9 @@ from api.demo.service import running_service
 from api.demo.storage import KEY_FILE, Stored, read_stored, rows_of
 from api.http.errors import StartError
 from api.http.receipts import read_receipt_key, verify_answer
-from api.process.opening import file_sealer, weak_privacy
 from api.process.preparation import calibrate_folder, default_probe_dims, make_generator
-from api.process.settings_file import settings_text
+from api.service.opening import file_sealer, weak_privacy
+from api.service.settings_file import settings_text
 from models.demo import build_demo_pack, is_demo_model
 from models.extraction import Extraction, Extractor
 from models.pack import ModelPack

@@ -48,20 +48,20 @@ from api.http.routes.page import page_routes
 from api.http.routes.reference import reference_routes
 from api.limits.admission import Downloads, Gate
 from api.limits.rates import RateLimits
-from api.process.allocator import give_back, keep_few_arenas
-from api.process.housekeeping import purge_regularly
-from api.process.logging import configure, log, uvicorn_log_config
-from api.process.metrics import count_lockout, join_shared_directory, set_build
-from api.process.opening import require_privacy, retention_of
-from api.process.operations import (
+from api.service.allocator import give_back, keep_few_arenas
+from api.service.housekeeping import purge_regularly
+from api.service.logging import configure, log, uvicorn_log_config
+from api.service.metrics import count_lockout, join_shared_directory, set_build
+from api.service.opening import require_privacy, retention_of
+from api.service.operations import (
     OPERATIONS_PATHS,
     Readiness,
     not_ready_once_told_to_stop,
     operations_server,
     tls_options,
 )
-from api.process.runtime import Runtime
-from api.process.supervised import end_with_supervisor, is_supervised, open_patiently, told_to_stop
+from api.service.runtime import Runtime
+from api.service.supervised import end_with_supervisor, is_supervised, open_patiently, told_to_stop
 from api.settings import NO_PROXIES, Settings
 from models.errors import ModelError
 from templates.contract.document import Contract

@@ -11,7 +11,7 @@ from api.http.errors import ApiError
 from api.http.tokens import USES, SubjectToken, opened_token, prefix_of
 from api.limits.admission import Gate
 from api.limits.rates import RateLimits
-from api.process.runtime import Runtime
+from api.service.runtime import Runtime
 from templates.keys.api_token import is_token
 from templates.store.api_keys import ApiKey
 

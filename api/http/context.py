@@ -18,8 +18,8 @@ from api.http.cors import Cors
 from api.http.errors import ERROR_CODES, ApiError
 from api.limits.admission import overloaded
 from api.limits.rates import RateLimits
-from api.process.logging import log
-from api.process.metrics import IN_FLIGHT, count_error, count_request
+from api.service.logging import log
+from api.service.metrics import IN_FLIGHT, count_error, count_request
 from models.demo import DEMO_NOTICE
 
 SANE_REQUEST_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{7,63}")

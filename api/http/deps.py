@@ -10,7 +10,7 @@ from pydantic import BeforeValidator
 from api.http.auth import Caller, CallerDep, holding, note_subject
 from api.http.errors import ApiError
 from api.limits.admission import Gate
-from api.process.runtime import Runtime
+from api.service.runtime import Runtime
 from templates.store.identifiers import SUBJECT_ID_RULE, checked_subject_id
 
 

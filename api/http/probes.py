@@ -29,8 +29,8 @@ from api.http.values import (
     embeddings_of,
     face_policy,
 )
-from api.process.metrics import step
-from api.process.runtime import Runtime
+from api.service.metrics import step
+from api.service.runtime import Runtime
 from api.settings import Settings
 from templates.space.agreement import distinct_rows
 from verify import (

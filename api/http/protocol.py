@@ -15,8 +15,8 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from api.http.answers import error_answer
 from api.http.context import LINGER_S, SECURITY_HEADERS
 from api.http.errors import ApiError
-from api.process.logging import log
-from api.process.metrics import count_error
+from api.service.logging import log
+from api.service.metrics import count_error
 
 MAX_HEAD_BYTES = 16 * 1024
 """Request line and headers. h11 bounds only what is incomplete; what comes at once, it takes."""

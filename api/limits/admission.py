@@ -10,7 +10,7 @@ import anyio.to_thread
 from starlette.requests import Request
 
 from api.http.errors import ApiError
-from api.process.metrics import COMPUTE_WAITING
+from api.service.metrics import COMPUTE_WAITING
 
 MAX_JSON_BYTES = 4 * 1024 * 1024
 """Largest JSON body. The largest template that the wire format admits, in base64, fits."""

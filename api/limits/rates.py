@@ -23,8 +23,8 @@ from limits.aio.strategies import SlidingWindowCounterRateLimiter
 from starlette.types import Scope
 
 from api.http.errors import ApiError, StartError
-from api.process.logging import log
-from api.process.metrics import RATE_LIMITED, RATE_STORAGE_FAILURES
+from api.service.logging import log
+from api.service.metrics import RATE_LIMITED, RATE_STORAGE_FAILURES
 from api.settings import OFF, Settings
 
 KEY_PREFIX = "veilface"

@@ -1,1 +1,1 @@
-"""One server process: settings to opened things, workers, logs, metrics, health."""
+"""What calibration and setup do, before a service can start."""

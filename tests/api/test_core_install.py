@@ -39,7 +39,7 @@ def test_the_service_and_every_command_are_imported_without_an_extra() -> None:
         for path in sorted(ROOT.rglob("*.py"))
         if path.name not in ("__init__.py", "__main__.py")
     ]
-    assert {"api.http.app", "api.process.runtime", "api.cli.evaluate", "api.demo.run"} < {*modules}
+    assert {"api.http.app", "api.service.runtime", "api.cli.evaluate", "api.demo.run"} < {*modules}
     done = import_without(OPTIONAL, *modules)
     assert done.returncode == 0, done.stderr
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from api.http.tokens import LONGEST_S, new_token
-from api.process.runtime import open_keyring, open_store
+from api.service.runtime import open_keyring, open_store
 from models.pack import ModelPack
 from tests.api.deployment import Deployment, bearer, images, photo
 from tests.patience import PATIENCE_S

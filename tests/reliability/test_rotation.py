@@ -11,8 +11,8 @@ from pathlib import Path
 import httpx
 import pytest
 
-from api.process.opening import open_keyring, open_store
-from api.process.runtime import Runtime
+from api.service.opening import open_keyring, open_store
+from api.service.runtime import Runtime
 from templates.store import Source
 from templates.store.audit_log import By
 from tests.api.deployment import Deployment, bearer, deploy, images, photo

@@ -19,7 +19,7 @@ import httpx
 import psycopg
 import pytest
 
-from api.process.opening import open_keyring, open_store
+from api.service.opening import open_keyring, open_store
 from tests.api.cli.conftest import run
 from tests.api.deployment import bearer, images
 from tests.patience import PATIENCE_S, wait_until

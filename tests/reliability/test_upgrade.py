@@ -18,7 +18,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from api.process.opening import open_keyring, open_store
+from api.service.opening import open_keyring, open_store
 from tests.api.deployment import Deployment, deploy
 from tests.patience import PATIENCE_S, wait_until
 from tests.ports import free_port

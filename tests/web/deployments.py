@@ -8,8 +8,8 @@ from typing import Any
 
 from api.demo.people import Scale
 from api.demo.run import run_demo
-from api.process.opening import file_sealer, open_keyring
 from api.process.preparation import recorded_of
+from api.service.opening import file_sealer, open_keyring
 from api.settings import Settings
 from models.pack import ModelPack
 from templates.contract.document import Contract

@@ -12,7 +12,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from api.process.runtime import open_keyring, open_store
+from api.service.runtime import open_keyring, open_store
 from api.settings import Settings
 from tests.patience import PATIENCE_S
 from tests.ports import free_port

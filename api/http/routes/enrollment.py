@@ -30,7 +30,7 @@ from api.http.preconditions import PreconditionDep, etag
 from api.http.schemas import EnrollmentAnswer
 from api.http.values import face_policy
 from api.limits.admission import Gate
-from api.process.runtime import Runtime
+from api.service.runtime import Runtime
 from enroll import Enrollment, Holder
 from models.quality import Quality
 from templates.decoys import Attributes

@@ -9,8 +9,8 @@ from starlette.responses import Response
 from api.http.answers import answer
 from api.http.openapi import error_responses
 from api.http.schemas import HealthAnswer
-from api.process.metrics import exposition
-from api.process.operations import Readiness
+from api.service.metrics import exposition
+from api.service.operations import Readiness
 
 router = APIRouter(tags=["health"])
 

@@ -17,7 +17,7 @@ from api.http.errors import ApiError
 from api.http.openapi import EVERY_CALL, error_responses
 from api.http.schemas import PackAnswer
 from api.limits.admission import Downloads
-from api.process.served_graphs import licence_of
+from api.service.served_graphs import licence_of
 
 router = APIRouter(prefix="/v1/pack", tags=["contract"])
 

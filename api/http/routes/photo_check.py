@@ -12,7 +12,7 @@ from api.http.errors import plain_details
 from api.http.openapi import BODY, CHECK_BODY, CHECKED_PHOTO, EVERY_CALL, error_responses
 from api.http.schemas import PhotoCheckAnswer
 from api.http.values import face_policy
-from api.process.metrics import step
+from api.service.metrics import step
 from models.errors import FaceError
 
 router = APIRouter(prefix="/v1/photos", tags=["photos"])

@@ -15,7 +15,7 @@ from api.http.openapi import BODY, EVERY_CALL, TOKEN_BODY, error_responses
 from api.http.schemas import TokenAnswer, TokenOutcomeAnswer
 from api.http.tokens import ACTIONS, LONGEST_S, new_token
 from api.http.values import iso_time
-from api.process.metrics import TOKENS
+from api.service.metrics import TOKENS
 from templates.store.audit_log import Entry, token_digest
 from templates.store.identifiers import checked_subject_id
 

@@ -23,8 +23,8 @@ from api.http.holder_keys import HolderKeyHeaderDep, wiping
 from api.http.openapi import BODY, EVERY_CALL, PHOTO, VERIFY_BODY, error_responses
 from api.http.probes import Probe, sent_probe
 from api.http.schemas import VerifyAnswer
-from api.process.metrics import count_decision, step
-from api.process.runtime import Runtime
+from api.service.metrics import count_decision, step
+from api.service.runtime import Runtime
 from templates.errors import ContractMismatch
 from templates.store.attempts import Attempt
 from templates.store.audit_log import By

@@ -4,7 +4,7 @@ import sqlite3
 
 import pytest
 
-from api.process.opening import open_keyring, open_store
+from api.service.opening import open_keyring, open_store
 from api.settings import Settings
 from tests.api.cli.conftest import copied, run
 

@@ -5,7 +5,7 @@ import pytest
 from api.cli.calibrate import parse_dims, read_aliases
 from api.cli.errors import CommandError, UsageError
 from api.cli.verdict import improvements, verdict_lines
-from api.process.opening import file_sealer
+from api.service.opening import file_sealer
 from attacks.operating_point import OperatingPoint, Tried
 from models.demo import DEMO_NOTICE
 from templates.contract.document import Contract

@@ -3,7 +3,7 @@ import stat
 
 import pytest
 
-from api.process.opening import file_sealer
+from api.service.opening import file_sealer
 from models.demo import DEMO_NOTICE
 from templates.contract.document import Binding
 from templates.decoys import DecoyGenerator, DecoyPool, load_source

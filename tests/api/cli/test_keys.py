@@ -14,7 +14,7 @@ import pytest
 from api.cli import master_keys
 from api.cli.master_keys import add_key, opened_store
 from api.http.receipts import receipt_json
-from api.process.opening import file_sealer, open_keyring
+from api.service.opening import file_sealer, open_keyring
 from api.settings import Settings
 from templates.contract.document import Contract
 from templates.keys.key_file import read_key_file, write_key_file

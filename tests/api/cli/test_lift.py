@@ -6,7 +6,7 @@ import stat
 import numpy as np
 import pytest
 
-from api.process.opening import file_sealer
+from api.service.opening import file_sealer
 from models.demo import DEMO_NOTICE
 from models.pack import ModelPack
 from templates.contract import wire

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from api.cli.calibrate_liveness import with_liveness_of
-from api.process.opening import file_sealer
+from api.service.opening import file_sealer
 from models.alignment import template
 from models.demo import DEMO_NOTICE
 from models.pack import ModelPack

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import sqlalchemy as sa
 
-from api.process.opening import open_keyring, open_store
+from api.service.opening import open_keyring, open_store
 from api.settings import Settings
 from templates.errors import StoreError
 from templates.keys.sealing import MasterKeyring

@@ -14,7 +14,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from api.process.opening import file_sealer
+from api.service.opening import file_sealer
 from models.demo import DEMO_NOTICE
 from templates.contract.document import Contract
 from templates.contract.levels import Rate

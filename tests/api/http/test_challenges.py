@@ -14,7 +14,7 @@ from api.http import challenges
 from api.http.app import create_app
 from api.http.errors import StartError
 from api.http.schemas import ChallengeAnswer, VerifyAnswer
-from api.process.runtime import Runtime
+from api.service.runtime import Runtime
 from models.pack import ModelPack
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, deploy, images, photo

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from api.http.errors import StartError
-from api.process.opening import open_decoys, open_keyring
 from api.process.preparation import binding_for, require_made_with
+from api.service.opening import open_decoys, open_keyring
 from models.pack import ModelPack
 from templates.contract.document import Contract
 from templates.decoys import DecoyGenerator

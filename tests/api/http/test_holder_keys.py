@@ -17,7 +17,7 @@ from api.http.schemas import (
     SubjectsAnswer,
     VerifyAnswer,
 )
-from api.process.runtime import Runtime
+from api.service.runtime import Runtime
 from templates.contract import wire
 from templates.contract.document import Contract
 from templates.keys.sealing import MasterKeyring

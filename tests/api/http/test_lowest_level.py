@@ -13,8 +13,8 @@ from typer.testing import CliRunner
 from api.cli.app import app
 from api.http.app import create_app
 from api.http.errors import StartError
-from api.process.opening import file_sealer, open_keyring, open_store
-from api.process.runtime import Runtime
+from api.service.opening import file_sealer, open_keyring, open_store
+from api.service.runtime import Runtime
 from models.pack import ModelPack
 from templates.contract import wire
 from templates.keys.randomness import Keystream

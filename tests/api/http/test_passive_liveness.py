@@ -9,15 +9,15 @@ import pytest
 
 from api.http.app import create_app
 from api.http.errors import StartError
-from api.process.opening import file_sealer, open_keyring
-from api.process.runtime import Runtime
+from api.service.opening import file_sealer, open_keyring
+from api.service.runtime import Runtime
 from api.settings import LivenessPolicy
 from models.pack import ModelPack
 from templates.contract.document import LivenessCalibration
 from tests.api.client import Client
 from tests.api.deployment import RATE, Deployment, bearer, deploy, images
 from tests.api.http.test_challenges import ANNA, PASSED, answered, challenge, failed, liveness
-from tests.api.process.test_metrics import Rise
+from tests.api.service.test_metrics import Rise
 from tests.heads import POSES, head, performed
 from tests.marked_heads import add_liveness, draw, encoded, write_marked_pack
 

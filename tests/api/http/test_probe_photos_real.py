@@ -11,7 +11,7 @@ import pytest
 
 from api.http.app import create_app
 from api.http.schemas import VerifyAnswer
-from api.process.opening import file_sealer, open_keyring
+from api.service.opening import file_sealer, open_keyring
 from models.decoding import decode_image
 from models.errors import FaceError
 from models.pack import ModelPack

@@ -20,7 +20,7 @@ from api.http.protocol import (
     Protocol,
 )
 from tests.api.deployment import bearer, deploy, images, photo
-from tests.api.process.test_server import Server
+from tests.api.service.test_server import Server
 from tests.ports import free_port
 
 PATIENCE_S = 60

@@ -21,7 +21,7 @@ from api.http.schemas import (
     VerifyAnswer,
 )
 from api.http.tokens import LONGEST_S, SubjectToken, new_token
-from api.process.opening import open_keyring, open_store
+from api.service.opening import open_keyring, open_store
 from templates.keys.holder_key import decode_holder_key
 from templates.store.audit_archive import TOKENS_LAST
 from tests.api.client import Client

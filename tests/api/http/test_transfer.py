@@ -10,7 +10,7 @@ from api.http.app import create_app
 from api.http.errors import StartError
 from api.http.schemas import ExportAnswer, ImportAnswer
 from api.http.transfer import MAGIC, Exported, ExportKey, open_export, seal_export
-from api.process.runtime import Runtime
+from api.service.runtime import Runtime
 from templates.contract import wire
 from templates.errors import ContractMismatch, InvalidTemplate
 from templates.keys.sealing import MasterKeyring

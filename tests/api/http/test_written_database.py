@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 import sqlalchemy as sa
 
-from api.process.opening import open_keyring, open_store
+from api.service.opening import open_keyring, open_store
 from templates.errors import StoreError
 from templates.store import TemplateStore
 from templates.store.database import Database

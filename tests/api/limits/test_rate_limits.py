@@ -23,7 +23,7 @@ from api.http.app import create_app, uvicorn_options
 from api.http.errors import ApiError, StartError
 from api.limits import rates as rate_limits
 from api.limits.rates import InProcess, InRedis, RateLimits, Storage, address_of
-from api.process.metrics import RATE_LIMITED, RATE_STORAGE_FAILURES
+from api.service.metrics import RATE_LIMITED, RATE_STORAGE_FAILURES
 from api.settings import Settings, load_settings
 from tests.api.deployment import Deployment, bearer, deploy
 from tests.api.shapes import assert_error
@@ -243,7 +243,7 @@ def test_while_redis_is_away_each_worker_counts_for_itself(
         return sum([await refusal(rates.count_key("a")) is None for _ in range(times)])
 
     async def scenario() -> None:
-        from api.process.logging import configure
+        from api.service.logging import configure
 
         configure("info")
         failures = RATE_STORAGE_FAILURES._value.get()

@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 import anyio
 
 from api.http.errors import DatabaseAway
-from api.process.logging import log
+from api.service.logging import log
 from templates.errors import StoreUnavailable
 
 T = TypeVar("T")

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from api.process.logging import FIELDS, JsonLines, configure, log, uvicorn_log_config
+from api.service.logging import FIELDS, JsonLines, configure, log, uvicorn_log_config
 from tests.api.client import Client
 from tests.api.deployment import Deployment, N, bearer, images, photo, unit
 from tests.api.http.test_enrollment import b64, lifted
@@ -167,4 +167,4 @@ def test_severity_is_a_threshold(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_uvicorn_writes_no_access_log() -> None:
     config = uvicorn_log_config("info")
     assert config["loggers"]["uvicorn.access"]["handlers"] == []
-    assert config["formatters"]["json"]["()"] == "api.process.logging.JsonLines"
+    assert config["formatters"]["json"]["()"] == "api.service.logging.JsonLines"

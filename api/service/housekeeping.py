@@ -7,8 +7,8 @@ from collections.abc import Callable
 import anyio
 import anyio.to_thread
 
-from api.process.logging import log
-from api.process.metrics import PURGE_FAILURES
+from api.service.logging import log
+from api.service.metrics import PURGE_FAILURES
 from templates.store import TemplateStore
 from templates.store.retention import Retention
 

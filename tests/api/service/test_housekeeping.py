@@ -9,7 +9,7 @@ import pytest
 import sqlalchemy as sa
 
 from api.http.app import create_app
-from api.process.opening import open_keyring, open_store
+from api.service.opening import open_keyring, open_store
 from templates.errors import StoreUnavailable
 from templates.store import By, TemplateStore
 from templates.store.schema import FailedAttemptsRow, SubjectRow

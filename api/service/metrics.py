@@ -37,8 +37,8 @@ from prometheus_client.multiprocess import MultiProcessCollector, mark_process_d
 from prometheus_client.registry import Collector
 
 from api.http.errors import ERROR_CODES
-from api.process.environment import variables_set
-from api.process.logging import log
+from api.service.environment import variables_set
+from api.service.logging import log
 
 DIRECTORY_VARIABLE = "PROMETHEUS_MULTIPROC_DIR"
 

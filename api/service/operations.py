@@ -16,10 +16,10 @@ from starlette.types import ASGIApp
 from api.http.errors import ApiError, StartError, api_error
 from api.http.protocol import Protocol
 from api.limits.admission import Gate
-from api.process.logging import log
-from api.process.metrics import MODEL_UP, STORE_UP
-from api.process.opening import try_inference
-from api.process.supervised import told_to_stop
+from api.service.logging import log
+from api.service.metrics import MODEL_UP, STORE_UP
+from api.service.opening import try_inference
+from api.service.supervised import told_to_stop
 from api.settings import Settings
 from models.errors import ModelError
 from models.pack import ModelPack

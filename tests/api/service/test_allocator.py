@@ -15,7 +15,7 @@ pytestmark = pytest.mark.skipif(
 
 COUNT = """
 import ctypes, sys, threading
-from api.process.allocator import keep_few_arenas
+from api.service.allocator import keep_few_arenas
 
 if sys.argv[2] != "many":
     assert keep_few_arenas(int(sys.argv[2]))

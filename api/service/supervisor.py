@@ -19,8 +19,8 @@ from uvicorn.supervisors import multiprocess
 from uvicorn.supervisors.multiprocess import SIGNALS, Multiprocess, Process
 
 from api.http.app import uvicorn_options
-from api.process.allocator import give_back
-from api.process.logging import configure, log
+from api.service.allocator import give_back
+from api.service.logging import configure, log
 from api.settings import Settings
 from templates.contract.document import Contract
 

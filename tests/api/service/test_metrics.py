@@ -23,8 +23,8 @@ from prometheus_client.parser import text_string_to_metric_families
 from api.http.app import VERSION
 from api.http.errors import ERROR_CODES
 from api.limits.admission import Gate
-from api.process.housekeeping import purge_regularly
-from api.process.metrics import exposition, shared_directory, step
+from api.service.housekeeping import purge_regularly
+from api.service.metrics import exposition, shared_directory, step
 from templates.store.lockout import LockedOut
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, deploy, environment_of, images, photo
@@ -256,8 +256,8 @@ def test_operations_md_explains_every_metric_and_no_other() -> None:
 
 COUNTS = """
 import sys
-from api.process.metrics import IN_FLIGHT, count_error, count_request, exposition
-from api.process.metrics import join_shared_directory
+from api.service.metrics import IN_FLIGHT, count_error, count_request, exposition
+from api.service.metrics import join_shared_directory
 join_shared_directory()
 IN_FLIGHT.inc(7)
 for _ in range(int(sys.argv[1])):

@@ -24,14 +24,14 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from api.http.app import create_app
 from api.http.context import RequestContext, _Body
 from api.http.errors import StartError
-from api.process.metrics import IN_FLIGHT, MODEL_UP, STORE_UP
-from api.process.operations import OPERATIONS_PATHS, operations_server, tls_options
+from api.service.metrics import IN_FLIGHT, MODEL_UP, STORE_UP
+from api.service.operations import OPERATIONS_PATHS, operations_server, tls_options
 from api.settings import Settings, load_settings
 from models.errors import ModelError
 from templates.store import TemplateStore
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, deploy, environment_of, images, photo
-from tests.api.process.test_server import in_flight
+from tests.api.service.test_server import in_flight
 from tests.api.shapes import assert_error
 from tests.certificates import self_signed
 from tests.patience import PATIENCE_S, wait_until
@@ -159,7 +159,7 @@ def test_recovery_is_seen_without_anybody_asking(
     deployment: Deployment, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(
-        "api.process.operations.Readiness.watch.__kwdefaults__", {"every_s": 0.05}, raising=False
+        "api.service.operations.Readiness.watch.__kwdefaults__", {"every_s": 0.05}, raising=False
     )
     with Client(create_app(deployment.settings)) as client:
         store = client.app.state.runtime.store

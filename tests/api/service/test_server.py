@@ -21,8 +21,8 @@ from tests.patience import PATIENCE_S, wait_until
 from tests.ports import free_port
 
 RUN = """
-from api.process.opening import open_contract, open_keyring
-from api.process.supervisor import run_server
+from api.service.opening import open_contract, open_keyring
+from api.service.supervisor import run_server
 from api.settings import load_settings
 
 settings = load_settings()

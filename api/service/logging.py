@@ -103,7 +103,7 @@ def uvicorn_log_config(level: str) -> dict[str, Any]:
     return {
         "version": 1,
         "disable_existing_loggers": False,
-        "formatters": {"json": {"()": "api.process.logging.JsonLines"}},
+        "formatters": {"json": {"()": "api.service.logging.JsonLines"}},
         "handlers": {
             "stderr": {
                 "class": "logging.StreamHandler",

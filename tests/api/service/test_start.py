@@ -17,7 +17,7 @@ from sqlalchemy.engine import Connection
 from api.http.app import create_app
 from api.http.errors import StartError
 from api.http.schemas import VerifyAnswer
-from api.process.opening import (
+from api.service.opening import (
     database_in_use,
     file_sealer,
     key_beside_database,
@@ -25,7 +25,7 @@ from api.process.opening import (
     open_store,
     try_inference,
 )
-from api.process.runtime import Runtime
+from api.service.runtime import Runtime
 from api.settings import Settings
 from models.pack import ModelPack
 from templates.contract.document import Contract, Rate
@@ -254,7 +254,7 @@ def test_of_two_first_starts_at_once_the_second_takes_the_firsts_key(
         made.append(MasterKeyring.create(path).current)
         return False
 
-    monkeypatch.setattr("api.process.opening.database_in_use", meanwhile)
+    monkeypatch.setattr("api.service.opening.database_in_use", meanwhile)
     assert [open_keyring(settings).current] == made
 
 

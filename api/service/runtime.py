@@ -18,7 +18,7 @@ from api.http.errors import ApiError
 from api.http.levels import Levels
 from api.http.liveness import LivenessRules
 from api.http.transfer import Exported, ExportKey, seal_export
-from api.process.opening import (
+from api.service.opening import (
     file_sealer,
     open_contract,
     open_decoys,
@@ -28,8 +28,8 @@ from api.process.opening import (
     prepare_database,
     try_inference,
 )
-from api.process.served_graphs import served_graphs
-from api.process.stand_in import SealedStandIn
+from api.service.served_graphs import served_graphs
+from api.service.stand_in import SealedStandIn
 from api.settings import Settings
 from enroll import Enroller, Enrollment
 from enroll.enroller import WIRE_DTYPE

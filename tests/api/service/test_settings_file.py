@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from api.process.settings_file import settings_text
+from api.service.settings_file import settings_text
 
 
 @pytest.mark.parametrize(

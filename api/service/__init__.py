@@ -1,0 +1,1 @@
+"""The running service: what it opens, its logs, metrics and health."""
