@@ -1,6 +1,6 @@
 """Bytes of an untrusted picture → upright RGB pixels, or an `ImageError`.
 
-Pillow parses; this module decides what it may parse. The format is read from the content, the
+Pillow decodes; this module decides what it may decode. The format is read from the content, the
 limits are checked on the header before a pixel is decoded, and whatever a parser raises on
 hostile bytes leaves as an `ImageError`.
 """
@@ -9,7 +9,6 @@ import hashlib
 import io
 import threading
 import warnings
-from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -19,46 +18,29 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from models.errors import ImageError
-from models.file_kinds import unread_file
-from models.lean import animated, jpeg_scans, lean
+from models.headers import animated, exif_orientation, read_head, unread_file, webp_canvas
 
 FORMATS = ("JPEG", "PNG", "WEBP", "BMP")
-# A JPEG that carries further pictures (MPO, portrait mode of many phones) is read as the first
-# one, the photo: the index of the others is not kept.
-_READ_AS = {"JPEG": "JPEG", "PNG": "PNG", "WEBP": "WebP", "BMP": "BMP"}
-
 SMALLER = "Send a smaller copy."
 
-# Some programs forget the end marker. Pixels that are missing with it are made up of what follows,
-# so that two endings give two pictures; where all are there, both give the same.
-_JPEG_END = b"\xff\xd9"
-_OTHER_END = bytes(range(254, 0, -1)) + _JPEG_END
+# The most scans of any JPEG, however small. Encoders write about ten.
+MAX_JPEG_SCANS = 100
 # RLE8 and RLE4: Pillow unpacks them in Python, 24 megapixels of 20 kB in 7 seconds.
 _BMP_RUNS = (1, 2)
-
-# Transparent pixels are laid over white, the background of identity photos.
-BACKGROUND = 255
-
-# The most of any picture, however small. Encoders write about ten.
-MAX_JPEG_SCANS = 100
-
-# Pillow reports odd metadata through `warnings`. The filters of that module are shared by all
-# threads, so they are changed under a lock, and only while metadata is read.
-_metadata_lock = threading.Lock()
-
-
-# Most bytes of memory that decoding takes for a pixel (measured: 7.2, 12.0 and 16.4). Pillow holds
-# 4, the result 3. A progressive JPEG keeps its coefficients, 2 bytes a channel; the WebP decoder
-# keeps two canvases and hands out a third.
-BYTES_PER_PIXEL = {"BMP": 8, "PNG": 8, "JPEG": 13, "WebP": 17}
-
-# What decoding may take at a time in one process: one WebP picture of the default limit, or
-# several smaller ones. A file of 38 bytes may unpack to all the pixels that the limits admit, so
-# the number of requests would otherwise multiply it.
-MEMORY_AT_A_TIME = 24_000_000 * 17
-
 # Pixels are converted in strips of rows, so that no second whole picture is held.
 _STRIP_PIXELS = 2**18
+
+BYTES_PER_PIXEL = 17
+"""Most memory that decoding takes for a pixel, its result included: 16.4 of WebP, as measured."""
+MEMORY_AT_A_TIME = 24_000_000 * BYTES_PER_PIXEL
+"""What decoding may take at a time in one process.
+
+A file of 38 bytes may unpack to all the pixels that the limits admit, so the number of requests
+would otherwise multiply it.
+"""
+
+# Pillow's own guard, as the error that it is from twice as many pixels on.
+warnings.simplefilter("error", Image.DecompressionBombWarning)
 
 
 class Turns:
@@ -74,34 +56,23 @@ class Turns:
     """
 
     def __init__(self, budget: int) -> None:
-        self._budget = budget
-        self._taken = 0
-        self._waiting: deque[object] = deque()
+        self._budget = self._free = budget
+        self._next = threading.Lock()
         self._changed = threading.Condition()
 
     @contextmanager
     def turn(self, size: int) -> Iterator[None]:
         """Wait until ``size`` bytes fit, and hold them."""
-        ticket = object()
-        with self._changed:
-            self._waiting.append(ticket)
-            try:
-                self._changed.wait_for(
-                    lambda: (
-                        self._waiting[0] is ticket
-                        and (self._taken == 0 or self._taken + size <= self._budget)
-                    )
-                )
-                self._taken += size
-            finally:
-                self._waiting.remove(ticket)
-                self._changed.notify_all()
+        size = min(size, self._budget)
+        with self._next, self._changed:
+            self._changed.wait_for(lambda: self._free >= size)
+            self._free -= size
         try:
             yield
         finally:
             with self._changed:
-                self._taken -= size
-                self._changed.notify_all()
+                self._free += size
+                self._changed.notify()
 
 
 _turns = Turns(MEMORY_AT_A_TIME)
@@ -139,9 +110,9 @@ def decode_image(data: bytes, *, limits: ImageLimits = DEFAULT_LIMITS) -> NDArra
     """Decode a JPEG, PNG, WebP or BMP picture.
 
     The EXIF orientation is applied. Greyscale, palette, CMYK and 16-bit pictures are converted
-    to 8-bit RGB (16 bits are scaled by 255/65535, not clipped); transparency is laid over white.
-    Animated pictures are refused: which frame was meant is not known. Pictures that
-    together take more than `MEMORY_AT_A_TIME` wait for each other.
+    to 8-bit RGB (16 bits are scaled by 255/65535, not clipped); transparency is laid over white,
+    the background of identity photos. Animated pictures are refused: which frame was meant is not
+    known. Pictures that together take more than `MEMORY_AT_A_TIME` wait for each other.
 
     Parameters
     ----------
@@ -161,7 +132,7 @@ def decode_image(data: bytes, *, limits: ImageLimits = DEFAULT_LIMITS) -> NDArra
         With code ``image_too_large`` or ``unsupported_image``. Nothing else escapes, whatever
         the bytes.
     """
-    if len(data) == 0:
+    if not data:
         raise ImageError("unsupported_image", "The photo is empty: send the complete file.")
     if len(data) > limits.max_bytes:
         raise ImageError(
@@ -170,10 +141,15 @@ def decode_image(data: bytes, *, limits: ImageLimits = DEFAULT_LIMITS) -> NDArra
             f" {SMALLER}",
         )
     try:
-        return _decode(data, limits)
+        image, orientation = _open(data, limits)
+        with _turns.turn(image.width * image.height * BYTES_PER_PIXEL):
+            with image:
+                image.load()
+                pixels = _rgb(image)
+            return np.ascontiguousarray(_upright(pixels, orientation))
     except ImageError:
         raise
-    except Image.DecompressionBombError:
+    except (Image.DecompressionBombError, Image.DecompressionBombWarning):
         raise ImageError(
             "image_too_large",
             f"The picture states more pixels than the decoder accepts. {SMALLER}",
@@ -185,7 +161,9 @@ def decode_image(data: bytes, *, limits: ImageLimits = DEFAULT_LIMITS) -> NDArra
     # Parsers of damaged files raise almost anything (struct.error, KeyError, TypeError, zlib.error
     # ...), so no narrower clause would hold. The cause is dropped: it may quote the bytes.
     except Exception:
-        raise _damaged() from None
+        raise ImageError(
+            "unsupported_image", "The picture is damaged or truncated; send the complete file."
+        ) from None
 
 
 def picture_digest(pixels: NDArray[np.uint8]) -> bytes:
@@ -207,76 +185,44 @@ def image_size(data: bytes) -> tuple[int, int] | None:
     No pixel is decoded, and turns by EXIF are not applied.
     """
     try:
-        _check_webp_canvas(data, DEFAULT_LIMITS)
-        parsed = lean(data)
-        with _metadata_lock, warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            with Image.open(io.BytesIO(parsed), formats=FORMATS) as image:
-                return image.size
+        with _open(data, DEFAULT_LIMITS)[0] as image:
+            return image.size
     except Exception:  # parsers of damaged files raise almost anything
         return None
 
 
-def _decode(data: bytes, limits: ImageLimits) -> NDArray[np.uint8]:
-    _check_webp_canvas(data, limits)
-    data = lean(data)
-    if not _is_jpeg_without_end(data):
-        return _pixels(data, limits)
-    data = data.rstrip(b"\xff")  # of an end marker that was cut in two
-    pixels = _pixels(data + _JPEG_END, limits)
-    if not np.array_equal(pixels, _pixels(data + _OTHER_END, limits)):
-        raise _damaged()
-    return pixels
-
-
-def _is_jpeg_without_end(data: bytes) -> bool:
-    return data.startswith(b"\xff\xd8\xff") and data.rfind(_JPEG_END) < data.rfind(b"\xff\xda")
-
-
-def _damaged() -> ImageError:
-    return ImageError(
-        "unsupported_image", "The picture is damaged or truncated; send the complete file."
-    )
-
-
-def _pixels(data: bytes, limits: ImageLimits) -> NDArray[np.uint8]:
-    with _metadata_lock, warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            image = Image.open(io.BytesIO(data), formats=FORMATS)
-        except UnidentifiedImageError:
-            raise ImageError("unsupported_image", unread_file(data)) from None
-        name = _check_header(image, data, limits)
-    with image, _turns.turn(image.width * image.height * BYTES_PER_PIXEL[name]):
-        image.load()
-        with _metadata_lock, warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            orientation = _orientation(image)  # PNG may carry it behind the pixels
-        return _rgb(image, orientation)
-
-
-def _check_webp_canvas(data: bytes, limits: ImageLimits) -> None:
-    """Check the canvas that a WebP file declares; its decoder allocates it when it is opened."""
-    if data[:4] != b"RIFF" or data[8:12] != b"WEBP" or len(data) < 30:
-        return
-    match data[12:16]:
-        case b"VP8X":
-            width = int.from_bytes(data[24:27], "little") + 1
-            height = int.from_bytes(data[27:30], "little") + 1
-        case b"VP8L" if data[20] == 0x2F:
-            bits = int.from_bytes(data[21:25], "little")
-            width, height = (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
-        case b"VP8 " if data[23:26] == b"\x9d\x01\x2a":
-            width = int.from_bytes(data[26:28], "little") & 0x3FFF
-            height = int.from_bytes(data[28:30], "little") & 0x3FFF
-        case _:
-            return
-    _check_size(width, height, limits)
+def _open(data: bytes, limits: ImageLimits) -> tuple[Image.Image, int]:
+    """Open a picture whose header is within the limits; with its orientation by EXIF."""
+    canvas = webp_canvas(data)
+    if canvas is not None:
+        _check_size(*canvas, limits)
+    head = read_head(data)
+    try:
+        image = Image.open(io.BytesIO(head.data), formats=FORMATS)
+    except UnidentifiedImageError:
+        raise ImageError("unsupported_image", unread_file(data)) from None
+    _check_size(image.width, image.height, limits)
+    if getattr(image, "is_animated", False):
+        raise animated("WebP")
+    if image.format == "BMP" and image.info["compression"] in _BMP_RUNS:
+        raise ImageError(
+            "unsupported_image",
+            "The BMP file is compressed: save it without compression, or as JPEG.",
+        )
+    pixels = image.width * image.height
+    most = min(MAX_JPEG_SCANS, limits.max_scans * limits.max_pixels // pixels)
+    if head.scans > most:
+        raise ImageError(
+            "unsupported_image",
+            f"The JPEG file draws its {pixels} pixels in more than {most} scans; save it again "
+            "as a baseline JPEG.",
+        )
+    if image.format == "WEBP":
+        return image, exif_orientation(image.info.get("exif", b""))
+    return image, head.orientation
 
 
 def _check_size(width: int, height: int, limits: ImageLimits) -> None:
-    if width <= 0 or height <= 0:
-        raise ImageError("unsupported_image", f"The picture has no pixels ({width} x {height}).")
     if max(width, height) > limits.max_side or width * height > limits.max_pixels:
         raise ImageError(
             "image_too_large",
@@ -285,75 +231,26 @@ def _check_size(width: int, height: int, limits: ImageLimits) -> None:
         )
 
 
-def _check_header(image: Image.Image, data: bytes, limits: ImageLimits) -> str:
-    """Check what the header states, and return the name of the format."""
-    name = _READ_AS.get(image.format or "")
-    if name is None:
-        raise ImageError("unsupported_image", unread_file(data))
-    _check_size(image.width, image.height, limits)
-    if name != "JPEG" and getattr(image, "is_animated", False):
-        raise animated(name)
-    if name == "BMP" and image.info["compression"] in _BMP_RUNS:
-        raise ImageError(
-            "unsupported_image",
-            "The BMP file is compressed: save it without compression, or as JPEG.",
-        )
-    if name == "JPEG":
-        pixels = image.width * image.height
-        most = min(MAX_JPEG_SCANS, limits.max_scans * limits.max_pixels // pixels)
-        if jpeg_scans(data, most=most) > most:
-            raise ImageError(
-                "unsupported_image",
-                f"The JPEG file draws its {pixels} pixels in more than {most} scans; save it again "
-                "as a baseline JPEG.",
-            )
-    return name
-
-
-def _orientation(image: Image.Image) -> int:
-    """EXIF orientation 1...8; 1 where it is absent or unreadable, as viewers do."""
-    try:
-        value = image.getexif().get(0x0112, 1)
-    # Broken EXIF does not make the picture unreadable, and its parser raises anything.
-    except Exception:
-        return 1
-    return value if isinstance(value, int) and 1 <= value <= 8 else 1
-
-
-def _rgb(image: Image.Image, orientation: int) -> NDArray[np.uint8]:
-    """Upright RGB pixels of a loaded picture, written strip by strip."""
+def _rgb(image: Image.Image) -> NDArray[np.uint8]:
+    """RGB pixels of a loaded picture, written strip by strip."""
     width, height = image.size
-    shape = (width, height, 3) if orientation in _ON_ITS_SIDE else (height, width, 3)
-    pixels = np.empty(shape, dtype=np.uint8)
-    stored = _upright(pixels, _INVERSE.get(orientation, orientation))  # as the file has them
+    pixels = np.empty((height, width, 3), dtype=np.uint8)
     rows = max(1, _STRIP_PIXELS // width)
     for top in range(0, height, rows):
-        bottom = min(height, top + rows)
-        stored[top:bottom] = _strip(image.crop((0, top, width, bottom)))
+        strip = image.crop((0, top, width, min(height, top + rows)))
+        if strip.mode.startswith("I"):  # 16 bits
+            strip = Image.fromarray(((np.asarray(strip, np.uint32) + 128) // 257).astype(np.uint8))
+        if strip.has_transparency_data:
+            white = Image.new("RGBA", strip.size, "white")
+            white.alpha_composite(strip.convert("RGBA"))
+            strip = white
+        pixels[top : top + rows] = np.asarray(strip.convert("RGB"))
     return pixels
-
-
-def _strip(image: Image.Image) -> NDArray[np.uint8]:
-    if image.mode.startswith("I"):
-        grey = np.asarray(image).astype(np.float32) * np.float32(255 / 65535)
-        whole = np.rint(grey).clip(0, 255).astype(np.uint8)
-        return np.broadcast_to(whole[:, :, None], (*whole.shape, 3))
-    if image.mode in ("LA", "PA", "RGBA", "La", "RGBa") or "transparency" in image.info:
-        image = image.convert("RGBA")
-        canvas = Image.new("RGBA", image.size, (BACKGROUND,) * 3 + (255,))
-        canvas.alpha_composite(image)
-        image = canvas
-    return np.asarray(image if image.mode == "RGB" else image.convert("RGB"), dtype=np.uint8)
-
-
-_ON_ITS_SIDE = (5, 6, 7, 8)
-# Turning left undoes turning right; the other orientations undo themselves.
-_INVERSE = {6: 8, 8: 6}
 
 
 def _upright(pixels: NDArray[np.uint8], orientation: int) -> NDArray[np.uint8]:
     """A view that undoes what EXIF tag 274 says the camera did (CIPA DC-008, 4.6.4)."""
-    if orientation in _ON_ITS_SIDE:
+    if orientation in (5, 6, 7, 8):
         pixels = pixels.transpose(1, 0, 2)
     if orientation in (2, 3, 6, 7):
         pixels = pixels[:, ::-1]

@@ -1,0 +1,208 @@
+"""What the head of a picture file says, read before a decoder sees the file.
+
+Pillow reads every part of a head, one after the other: a file of 10 MiB may hold a million empty
+parts, ten thousand profiles that unpack to a megabyte each, or EXIF in half a million pieces,
+which it joins one by one. So a decoder gets a file without metadata, in a bounded number of parts, and the
+orientation, which is the only metadatum that is used, is read here.
+"""
+
+import re
+import struct
+from dataclasses import dataclass, field
+
+from models.errors import ImageError
+
+MAX_PNG_CHUNKS = 2**16
+"""In 10 MiB, as many as chunks of 160 bytes; encoders write thousands of bytes in each."""
+MAX_JPEG_SEGMENTS = 4096
+"""Before the first scan. Encoders write about ten, and a profile of 16 MiB needs 256."""
+
+_PNG = b"\x89PNG\r\n\x1a\n"
+_PNG_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
+
+_JPEG = b"\xff\xd8\xff"
+_FILL = re.compile(rb"\xff+")
+# Inside the coded pixels, 0xFF before 0x00 or a restart marker is none.
+_MARKER_AFTER_PIXELS = re.compile(rb"\xff+([\x01-\xcf\xd8-\xfe])")
+_SCAN = 0xDA
+_END = 0xD9
+_EXIF = 0xE1
+# JFIF and Adobe say which colours the channels are.
+_COLOURS = {0xE0: b"JFIF", 0xEE: b"Adobe"}
+_UNREAD = frozenset((0x00, 0xFE, *range(0xE0, 0xF0)))  # junk, comments, applications' own
+_WITHOUT_LENGTH = frozenset((0x00, 0x01, *range(0xD0, 0xDA)))
+
+# Asked in this order. Why none of these pictures is read: docs/models.md.
+_OTHER_FILES: tuple[tuple[str, bytes], ...] = (
+    ("an AVIF picture", rb"....ftyp.{0,64}avi[fs]"),
+    ("a HEIC picture", rb"....ftyp(hei|hev|mif1|msf1)"),
+    ("a video", rb"....ftyp|\x1aE\xdf\xa3|RIFF....AVI "),
+    ("a GIF picture", rb"GIF8[79]a"),
+    ("a TIFF or raw picture", rb"II[*+]\0|MM\0[*+]"),
+    ("a JPEG 2000 picture", rb"\0\0\0\x0cjP {2}|\xff\x4f\xff\x51"),
+    ("a JPEG XL picture", rb"\xff\x0a|\0\0\0\x0cJXL "),
+    ("a PDF document", rb"%PDF-"),
+    ("a ZIP archive", rb"PK\x03\x04"),
+    ("an SVG drawing", rb"\s*(<\?xml.{0,400})?<svg"),
+    ("a web page", rb"\s*<(!doctype html|html)"),
+    ("a picture in base64", rb"\s*(data:image/|/9j/|iVBORw0K|UklGR)"),
+)
+_REMEDIES = {
+    "a picture in base64": "send the bytes that the text stands for",
+    "a web page": "save the photo itself, not the page that shows it",
+}
+
+
+@dataclass(frozen=True)
+class Head:
+    """A picture file that is ready for a decoder, and what its head said.
+
+    Attributes
+    ----------
+    data
+        The file; a JPEG or PNG file without metadata.
+    orientation
+        By EXIF, 1...8; 1 where it is absent. That of a WebP file is left to `exif_orientation`.
+    scans
+        Of a JPEG file: walks over the picture that decoding takes.
+    """
+
+    data: bytes = field(repr=False)
+    orientation: int = 1
+    scans: int = 0
+
+
+def read_head(data: bytes) -> Head:
+    """Read the head of a file, and take out what pixels and orientation do not need.
+
+    Raises
+    ------
+    ImageError
+        With code ``unsupported_image``: an animated PNG, a JPEG without a scan, or a file in too
+        many parts.
+    """
+    if data.startswith(_PNG):
+        return _png_head(data)
+    if data.startswith(_JPEG):
+        return _jpeg_head(data)
+    return Head(data)
+
+
+def _png_head(data: bytes) -> Head:
+    view, kept, orientation, at = memoryview(data), [memoryview(_PNG)], 1, len(_PNG)
+    for _ in range(MAX_PNG_CHUNKS):
+        name = data[at + 4 : at + 8]
+        end = at + 12 + int.from_bytes(data[at : at + 4])  # length, name and checksum around it
+        if name == b"acTL":
+            raise animated("PNG")
+        if name == b"eXIf":
+            orientation = exif_orientation(data[at + 8 : end - 4])
+        if name in _PNG_CHUNKS:
+            kept.append(view[at:end])
+        if name == b"IEND" or end >= len(data):
+            return Head(b"".join(kept), orientation)
+        at = end
+    raise _too_many("PNG", MAX_PNG_CHUNKS, "chunks")
+
+
+def _jpeg_head(data: bytes) -> Head:
+    view, kept, orientation, at = memoryview(data), [memoryview(data)[:2]], 1, 2
+    for _ in range(MAX_JPEG_SEGMENTS):
+        # Junk before a marker, and bytes that fill up to it, are skipped by every decoder.
+        fill = _FILL.search(data, at)
+        if fill is None or fill.end() == len(data):
+            raise ImageError(
+                "unsupported_image", "The JPEG file is damaged or truncated in its head."
+            )
+        start, marker = fill.end() - 1, data[fill.end()]
+        if marker == _SCAN:
+            return Head(b"".join([*kept, view[start:]]), orientation, _scans(data, start))
+        at = start + 2
+        if marker not in _WITHOUT_LENGTH:
+            at += int.from_bytes(data[at : at + 2])
+        content = data[start + 4 : at]
+        if marker == _EXIF and content.startswith(b"Exif\0\0"):
+            orientation = exif_orientation(content)
+        if marker in _COLOURS:
+            is_needed = content.startswith(_COLOURS[marker])
+        else:
+            is_needed = marker not in _UNREAD
+        if is_needed:
+            kept.append(view[start:at])
+    raise _too_many("JPEG", MAX_JPEG_SEGMENTS, "parts before its first scan")
+
+
+def _scans(data: bytes, at: int) -> int:
+    """Count the scans of a JPEG file's first picture, from the first one on.
+
+    Only markers count, up to the end of that picture, as a decoder reads them: further pictures,
+    and the film that a phone appends, may hold the same bytes.
+    """
+    scans = 0
+    while (match := _MARKER_AFTER_PIXELS.search(data, at)) is not None and match[1][0] != _END:
+        marker, at = match[1][0], match.end()
+        scans += marker == _SCAN
+        if marker not in _WITHOUT_LENGTH:
+            at += int.from_bytes(data[at : at + 2])
+    return scans
+
+
+def exif_orientation(exif: bytes) -> int:
+    """Orientation 1...8 in an EXIF body; 1 where it is absent or unreadable, as viewers do.
+
+    References
+    ----------
+    CIPA DC-008 (Exif 3.0), 4.6.2 and 4.6.4: TIFF header, entries of the first directory, tag 274.
+    """
+    exif = exif.removeprefix(b"Exif\0\0")
+    order = {b"II*\0": "<", b"MM\0*": ">"}.get(exif[:4])
+    if order is None:
+        return 1
+    try:
+        (start,) = struct.unpack_from(f"{order}I", exif, 4)
+        (count,) = struct.unpack_from(f"{order}H", exif, start)
+        for entry in range(start + 2, start + 2 + 12 * count, 12):
+            tag, kind, _, value = struct.unpack_from(f"{order}HHIH", exif, entry)
+            if tag == 0x0112:
+                return value if kind == 3 and 1 <= value <= 8 else 1
+    except struct.error:  # it ends before what it announces
+        pass
+    return 1
+
+
+def webp_canvas(data: bytes) -> tuple[int, int] | None:
+    """Width and height that a WebP file declares; its decoder allocates them when it is opened."""
+    if data[:4] != b"RIFF" or data[8:12] != b"WEBP" or len(data) < 30:
+        return None
+    match data[12:16]:
+        case b"VP8X":
+            sides = int.from_bytes(data[24:27], "little"), int.from_bytes(data[27:30], "little")
+            return sides[0] + 1, sides[1] + 1
+        case b"VP8L":
+            bits = int.from_bytes(data[21:25], "little")
+            return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+        case b"VP8 ":
+            width, height = struct.unpack_from("<HH", data, 26)
+            return width & 0x3FFF, height & 0x3FFF
+    return None
+
+
+def animated(name: str) -> ImageError:
+    """Return the refusal of a picture that moves."""
+    return ImageError(
+        "unsupported_image",
+        f"The {name} file is animated; send a still picture, so that the frame is known.",
+    )
+
+
+def unread_file(data: bytes) -> str:
+    """Return the sentence that refuses a file, and names what it is where that is known."""
+    for kind, pattern in _OTHER_FILES:
+        if re.match(pattern, data[:512], re.DOTALL | re.IGNORECASE):
+            remedy = _REMEDIES.get(kind, "save it as JPEG, and send that")
+            return f"The file is {kind}, which is not read: {remedy}."
+    return "The file is not a JPEG, PNG, WebP or BMP picture, or is damaged."
+
+
+def _too_many(name: str, most: int, parts: str) -> ImageError:
+    return ImageError("unsupported_image", f"The {name} file has more than {most} {parts}.")
