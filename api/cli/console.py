@@ -87,13 +87,18 @@ def table(title: str, *columns: str) -> "Table":
 
 def show(*tables: "Table") -> None:
     """Write tables to stdout."""
+    for listing in tables:
+        print_rich(listing)
+
+
+def print_rich(listing: "Table") -> None:
+    """Write a table to stdout; its cells are plain text, without markup."""
     from rich.console import Console
 
     width = None if sys.stdout.isatty() else _WIDTH_OF_A_FILE
-    console = Console(file=sys.stdout, width=width)
+    console = Console(file=sys.stdout, width=width, markup=False)
     with console.capture() as captured:
-        for listing in tables:
-            console.print(listing)
+        console.print(listing)
     say(captured.get().removesuffix("\n"))
 
 

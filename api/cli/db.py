@@ -6,9 +6,10 @@ from typing import Annotated
 
 import typer
 
-from api.cli.console import emit, message, say
+from api.cli.console import emit, say
 from api.cli.errors import UsageError
-from api.cli.options import STORE, AsJson, Tenant, takes_settings
+from api.cli.options import STORE, Tenant, takes_settings
+from api.cli.results import Result, reports
 from api.http.audit import operator
 from api.http.receipts import receipt_json
 from api.service.opening import checked_store, open_keyring, open_store, retention_of
@@ -27,8 +28,8 @@ def db() -> None:
 
 
 @app.command()
-@takes_settings(*STORE)
-def upgrade(*, settings: Settings, as_json: AsJson = False) -> None:
+@reports(*STORE)
+def upgrade(*, settings: Settings) -> Result:
     """Migrate the database to the schema of this version.
 
     `serve` does this when it starts; run it first if several machines start at once.
@@ -43,17 +44,17 @@ def upgrade(*, settings: Settings, as_json: AsJson = False) -> None:
         after = _revision(settings)
     finally:
         store.close()
-    if as_json:
-        emit({"before": before, "after": after})
-    elif before == after:
-        say(f"The schema is up to date: {after}.")
-    else:
-        say(f"Migrated from {before or 'an empty database'} to {after}.")
+    return Result(
+        {"before": before, "after": after},
+        f"The schema is up to date: {after}."
+        if before == after
+        else f"Migrated from {before or 'an empty database'} to {after}.",
+    )
 
 
 @app.command()
-@takes_settings(*STORE)
-def check(*, settings: Settings, as_json: AsJson = False) -> None:
+@reports(*STORE)
+def check(*, settings: Settings) -> Result:
     """Check that the schema and the master key match; exit status 1 if they do not.
 
     Example: `veilface db check --data-dir veilface-data`
@@ -62,36 +63,32 @@ def check(*, settings: Settings, as_json: AsJson = False) -> None:
     try:
         store.check()
     except VeilfaceError as error:
-        if as_json:
-            emit({"ok": False, "reason": str(error)})
-        message(f"error: {error}")
-        raise typer.Exit(1) from None
+        return Result({"ok": False, "reason": str(error)}, error=str(error))
     finally:
         store.close()
-    if as_json:
-        emit({"ok": True, "reason": None})
-    else:
-        say("The database has the right schema, and this is its master key.")
+    return Result(
+        {"ok": True, "reason": None},
+        "The database has the right schema, and this is its master key.",
+    )
 
 
 @app.command()
-@takes_settings("data_dir", "database_url")
-def current(*, settings: Settings, as_json: AsJson = False) -> None:
+@reports("data_dir", "database_url")
+def current(*, settings: Settings) -> Result:
     """Show which schema the database has and which one this version needs.
 
     Example: `veilface db current --json`
     """
-    revision = _revision(settings)
-    needed = head_revision()
-    if as_json:
-        emit({"current": revision, "needed": needed})
-    else:
-        say(f"The database is at {revision or 'no schema yet'}; this version needs {needed}.")
+    revision, needed = _revision(settings), head_revision()
+    return Result(
+        {"current": revision, "needed": needed},
+        f"The database is at {revision or 'no schema yet'}; this version needs {needed}.",
+    )
 
 
 @app.command()
-@takes_settings(*STORE)
-def compact(*, settings: Settings, as_json: AsJson = False) -> None:
+@reports(*STORE)
+def compact(*, settings: Settings) -> Result:
     """Rewrite the database files, so that no page keeps erased data.
 
     On PostgreSQL this is `VACUUM (FULL)` of the tables that hold subject data: remains of erased
@@ -106,21 +103,20 @@ def compact(*, settings: Settings, as_json: AsJson = False) -> None:
         before = store.database.size()
         store.compact()
         after = store.database.size()
-    if as_json:
-        emit({"bytes_before": before, "bytes_after": after})
-    else:
-        say(f"Compacted the database: {before:,} bytes before, {after:,} after.")
+    return Result(
+        {"bytes_before": before, "bytes_after": after},
+        f"Compacted the database: {before:,} bytes before, {after:,} after.",
+    )
 
 
 @app.command()
-@takes_settings(*STORE, "default_tenant")
+@reports(*STORE, "default_tenant")
 def unlock(
     subject: Annotated[str, typer.Argument(help="Subject to unlock.")],
     *,
     settings: Settings,
     tenant: Tenant = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Result:
     """Clear the failed attempts of a subject; exit status 1 if there are none.
 
     Use it to re-enable a subject that was disabled after many failures. Make sure first that it was
@@ -131,25 +127,21 @@ def unlock(
     name = tenant or settings.default_tenant
     with checked_store(settings) as store:
         lifted = store.attempts.reset(name, subject, by=operator())
-    if as_json:
-        emit({"subject_id": subject, "tenant": name, "lifted": lifted})
-    elif lifted:
-        say(f"Cleared the failed attempts of {subject}.")
+    facts = {"subject_id": subject, "tenant": name, "lifted": lifted}
     if not lifted:
-        message("error: this subject has no failed attempts")
-        raise typer.Exit(1)
+        return Result(facts, error="this subject has no failed attempts")
+    return Result(facts, f"Cleared the failed attempts of {subject}.")
 
 
 @app.command()
-@takes_settings(*STORE, "retention_days", "retention_disuse_days")
+@reports(*STORE, "retention_days", "retention_disuse_days")
 def purge(
     *,
     settings: Settings,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Report how many are due; erase none.")
     ] = False,
-    as_json: AsJson = False,
-) -> None:
+) -> Result:
     """Erase subjects whose retention period has ended, and remove expired records.
 
     The service does this every `purge_interval_s` seconds. Each erased subject leaves a
@@ -163,18 +155,18 @@ def purge(
         if not dry_run:
             erased = store.retention.erase_expired(retention)
             log_purged = store.purge()
-    if as_json:
-        emit({"due": due, "erased": erased, "log_purged": log_purged})
-    elif dry_run:
-        say(f"{due} subjects are due to be erased.")
-    else:
-        say(f"Erased {erased} subjects and all expired records.")
-        if not log_purged:
-            say("A reader keeps old pages in SQLite's write-ahead log: purge again when it ended.")
+    text = [f"Erased {erased} subjects and all expired records."]
+    if dry_run:
+        text = [f"{due} subjects are due to be erased."]
+    elif not log_purged:
+        text.append(
+            "A reader keeps old pages in SQLite's write-ahead log: purge again when it ended."
+        )
+    return Result({"due": due, "erased": erased, "log_purged": log_purged}, text)
 
 
 @app.command("template-enrollment")
-@takes_settings(*STORE, "default_tenant")
+@reports(*STORE, "default_tenant")
 def template_enrollment(
     *,
     settings: Settings,
@@ -185,8 +177,7 @@ def template_enrollment(
             "--allow/--forbid", help="Unset: show the current setting.", show_default=False
         ),
     ] = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Result:
     """Allow or forbid a tenant's clients to enroll templates that they made themselves.
 
     Forbidden unless you allow it. Nothing in a template tells whether it holds one person: whoever
@@ -199,17 +190,13 @@ def template_enrollment(
     """
     name = tenant or settings.default_tenant
     with checked_store(settings) as store:
-        if allow is None:
-            allowed = store.tenants.get(name).template_enrollment
-        else:
-            allowed = store.tenants.set_template_enrollment(
-                name, allow, by=operator()
-            ).template_enrollment
-    if as_json:
-        emit({"tenant": name, "template_enrollment": allowed})
-    else:
-        does = "takes" if allowed else "does not take"
-        say(f"Tenant {name} {does} templates that clients made.")
+        if allow is not None:
+            store.tenants.set_template_enrollment(name, allow, by=operator())
+        allowed = store.tenants.get(name).template_enrollment
+    return Result(
+        {"tenant": name, "template_enrollment": allowed},
+        f"Tenant {name} {'takes' if allowed else 'does not take'} templates that clients made.",
+    )
 
 
 @app.command("erase-tenant")

@@ -58,8 +58,6 @@ def group_tables(contract: Contract) -> list[Any]:
 
 
 def _group_table(level: Level, *, photos: int) -> Any:
-    from rich.markup import escape
-
     listing = table(
         f"by group at {level.name}, probes of {photos_in_words(photos)}; "
         "* too few trials to be judged",
@@ -67,8 +65,8 @@ def _group_table(level: Level, *, photos: int) -> Any:
     )
     for entry in level.groups:
         listing.add_row(
-            escape(entry.attribute),
-            escape(entry.group),
+            entry.attribute,
+            entry.group,
             _marked(entry.fmr, judged=entry.fmr_judged),
             _marked(entry.frr, judged=entry.frr_judged),
         )

@@ -1,30 +1,39 @@
 """``veilface keys``: API keys, the master key, and receipts of erasure."""
 
-from datetime import datetime, timedelta
+from collections.abc import Mapping
+from datetime import timedelta
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from api.cli import master_keys, renewal
-from api.cli.console import as_json_text, emit, message, progress, say, show, table
+from api.cli import master_keys
+from api.cli.console import message, progress
 from api.cli.errors import CommandError
 from api.cli.files import read_bounded
 from api.cli.master_keys import FILES, opened_store
-from api.cli.new_key import show_once
-from api.cli.options import STORE, AsJson, Tenant, takes_settings
+from api.cli.options import STORE, Tenant
 from api.cli.public_key import PublicKey, read_public_key
+from api.cli.results import Result, Table, reports
 from api.http.audit import operator
 from api.http.receipts import verify_answer
 from api.service.opening import open_contract, open_keyring
 from api.settings import Settings
 from templates.contract.canonical import parse_object
 from templates.errors import StoreError
-from templates.store.api_keys import ApiKey, Right
+from templates.keys.private_file import create_private
+from templates.store.api_keys import ApiKey, NewApiKey, Right
 from templates.store.identifiers import utc_now
 from templates.store.receipts import key_fingerprint
 
 MAX_JSON_BYTES = 2**20
+
+KeyFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--out", help="New file for the key, of mode 0600. Unset: it goes to stdout, once."
+    ),
+]
 
 app = typer.Typer(no_args_is_help=True)
 
@@ -34,8 +43,17 @@ def keys() -> None:
     """Create, replace and revoke API keys; rotate keys; verify erasure receipts."""
 
 
+for _command in (
+    master_keys.master,
+    master_keys.rotate,
+    master_keys.rewrap,
+    master_keys.renew,
+):
+    app.command()(_command)
+
+
 @app.command()
-@takes_settings(*STORE, "default_tenant")
+@reports(*STORE, "default_tenant")
 def create(
     *,
     settings: Settings,
@@ -59,8 +77,8 @@ def create(
             "of a larger false match rate. Unset: the setting `lowest_level`."
         ),
     ] = None,
-    as_json: AsJson = False,
-) -> None:
+    out: KeyFile = None,
+) -> Result:
     """Create an API key and show it once.
 
     Needs: the database and its master key; the service may run meanwhile. Give a key no more
@@ -73,55 +91,45 @@ def create(
         store.tenants.create(name)
         expires = None if days is None else utc_now() + timedelta(days=days)
         made = store.api_keys.create(
-            name,
-            right,
-            label=label,
-            expires_at=expires,
-            lowest_level=lowest_level,
-            by=operator(),
+            name, right, label=label, expires_at=expires, lowest_level=lowest_level, by=operator()
         )
-        if as_json:
-            text = as_json_text({"token": made.token, **_described(made.key)})
-        else:
-            message(f"Key {made.key.prefix} of tenant {name}, shown only now:")
-            text = made.token
-        show_once(store, made, text)
+    return _shown_once(made, f"Key {made.key.prefix} of tenant {name}", out)
 
 
 @app.command("list")
-@takes_settings(*STORE)
+@reports(*STORE)
 def list_keys(
     *,
     settings: Settings,
     tenant: Annotated[str | None, typer.Option(help="Only this tenant's.")] = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Result:
     """List API keys by prefix; the keys themselves are not kept.
 
     Example: `veilface keys list --tenant default`
     """
     with opened_store(settings) as store:
         keys = store.api_keys.all(tenant=tenant)
-    if as_json:
-        emit([_described(key) for key in keys])
-        return
-    columns = ("prefix", "tenant", "rights", "lowest level", "label", "state")
-    listing = table("API keys", *columns, "last used")
-    for key in keys:
-        listing.add_row(
-            key.prefix,
-            key.tenant,
-            ", ".join(sorted(key.rights)),
-            key.lowest_level or "any",
-            key.label,
-            _state(key),
-            "never" if key.last_used_at is None else f"{key.last_used_at:%Y-%m-%d %H:%M}",
-        )
-    show(listing)
+    listing = Table(
+        "API keys",
+        ("prefix", "tenant", "rights", "lowest level", "label", "state", "last used"),
+        [
+            (
+                key.prefix,
+                key.tenant,
+                ", ".join(sorted(key.rights)),
+                key.lowest_level or "any",
+                key.label,
+                _state(key),
+                "never" if key.last_used_at is None else f"{key.last_used_at:%Y-%m-%d %H:%M}",
+            )
+            for key in keys
+        ],
+    )
+    return Result([_described(key) for key in keys], [listing])
 
 
 @app.command()
-@takes_settings(*STORE)
+@reports(*STORE)
 def revoke(
     prefix: Annotated[
         str,
@@ -129,25 +137,22 @@ def revoke(
     ],
     *,
     settings: Settings,
-    as_json: AsJson = False,
-) -> None:
+) -> Result:
     """Revoke an API key for good; exit status 1 if there is none to revoke.
 
     Example: `veilface keys revoke 3f9a1c0b7d2e`
     """
     with opened_store(settings) as store:
         revoked = store.api_keys.revoke(prefix, by=operator())
-    if as_json:
-        emit({"prefix": prefix, "revoked": revoked})
-    elif revoked:
-        say(f"Key {prefix} is revoked.")
+    facts = {"prefix": prefix, "revoked": revoked}
     if not revoked:
-        message("error: no key of this prefix, or it was revoked before; see `veilface keys list`")
-        raise typer.Exit(1)
+        error = "no key of this prefix, or it was revoked before; see `veilface keys list`"
+        return Result(facts, error=error)
+    return Result(facts, f"Key {prefix} is revoked.")
 
 
 @app.command()
-@takes_settings(*STORE)
+@reports(*STORE)
 def replace(
     prefix: Annotated[
         str,
@@ -159,8 +164,8 @@ def replace(
         float,
         typer.Option(min=0, max=8760, help="Hours for which the old key still works."),
     ] = 24.0,
-    as_json: AsJson = False,
-) -> None:
+    out: KeyFile = None,
+) -> Result:
     """Replace a key, which then expires, by a new one with the same rights; show it once.
 
     The new key keeps the tenant, label and lowest level. Hand it over before the grace period ends;
@@ -170,18 +175,23 @@ def replace(
     """
     with opened_store(settings) as store:
         made = store.api_keys.replace(prefix, grace=timedelta(hours=grace_hours), by=operator())
-        if made is None:
-            raise CommandError("no valid key of this prefix; see `veilface keys list`")
-        if as_json:
-            text = as_json_text({"token": made.token, "replaces": prefix, **_described(made.key)})
-        else:
-            message(f"Key {made.key.prefix} replaces {prefix}, shown only now:")
-            text = made.token
-        show_once(store, made, text)
+    if made is None:
+        raise CommandError("no valid key of this prefix; see `veilface keys list`")
+    return _shown_once(made, f"Key {made.key.prefix} replaces {prefix}", out, replaces=prefix)
+
+
+def _shown_once(made: NewApiKey, what: str, out: Path | None, **facts: str) -> Result:
+    """Write the token to a private file, or else to stdout, where nothing else goes."""
+    facts_of_key = {**facts, **_described(made.key)}
+    if out is not None:
+        create_private(out, f"{made.token}\n".encode())
+        return Result({"out": out, **facts_of_key}, f"{what}: {out}")
+    message(f"{what}, shown only now:")
+    return Result({"token": made.token, **facts_of_key}, made.token)
 
 
 @app.command("rotate-tenant")
-@takes_settings(*FILES, "default_tenant")
+@reports(*FILES, "default_tenant")
 def rotate_tenant(
     *,
     settings: Settings,
@@ -200,8 +210,7 @@ def rotate_tenant(
             "--finish", help="Make no new key; go on with a renewal that was interrupted."
         ),
     ] = False,
-    as_json: AsJson = False,
-) -> None:
+) -> Result:
     """Give a tenant a new rotation key, and turn its stored templates by it.
 
     Nobody has to enroll again, and the service may run meanwhile; the old key is dropped at the
@@ -228,38 +237,34 @@ def rotate_tenant(
                 moved = rotations.move(name, binding, by=operator(), progress=advance)
         left = list(rotations.subjects_of_old_epochs(name))
         dropped = 0 if left else rotations.retire(name, by=operator())
-    if as_json:
-        emit(
-            {
-                "tenant": name,
-                "rotation_epoch": epoch,
-                "moved": moved,
-                "enroll_again": left,
-                "rotations_dropped": dropped,
-            }
-        )
-        return
-    say(f"Tenant {name} is in rotation epoch {epoch}; {moved} templates were turned into it.")
+    text = [f"Tenant {name} is in rotation epoch {epoch}; {moved} templates were turned into it."]
     if left:
-        say(f"{len(left)} subjects keep an older rotation until they are enrolled again:")
-        for subject in left:
-            say(f"  {subject}")
-        say(f"Then run `veilface keys rotate-tenant --tenant {name} --stolen --finish`.")
+        text += [
+            f"{len(left)} subjects keep an older rotation until they are enrolled again:",
+            *(f"  {subject}" for subject in left),
+            f"Then run `veilface keys rotate-tenant --tenant {name} --stolen --finish`.",
+        ]
     elif dropped:
-        say(f"Dropped the keys of {dropped} older epochs.")
-
-
-for _command in (master_keys.master, master_keys.rotate, master_keys.rewrap, renewal.renew):
-    app.command()(_command)
+        text.append(f"Dropped the keys of {dropped} older epochs.")
+    return Result(
+        {
+            "tenant": name,
+            "rotation_epoch": epoch,
+            "moved": moved,
+            "enroll_again": left,
+            "rotations_dropped": dropped,
+        },
+        text,
+    )
 
 
 @app.command("verify-receipt")
+@reports()
 def verify_receipt(
     receipt: Annotated[Path, typer.Argument(help="JSON that the DELETE call returned.")],
     *,
     public_key: PublicKey,
-    as_json: AsJson = False,
-) -> None:
+) -> Result:
     """Verify an erasure receipt; exit status 1 if it is not valid.
 
     Needs no service and no other key: take `GET /v1/contract` once, which names the public key, and
@@ -273,28 +278,23 @@ def verify_receipt(
     try:
         claims = verify_answer(answer, key)
     except StoreError as error:
-        if as_json:
-            emit({"valid": False, "reason": str(error)})
-        message(f"error: {error}")
-        raise typer.Exit(1) from None
-    if as_json:
-        emit({"valid": True, "claims": claims, "key_id": key_fingerprint(key)})
-    else:
-        _say_claims(claims)
+        return Result({"valid": False, "reason": str(error)}, error=str(error))
+    return Result({"valid": True, "claims": claims, "key_id": key_fingerprint(key)}, _told(claims))
 
 
-def _say_claims(claims: dict[str, Any]) -> None:
+def _told(claims: Mapping[str, Any]) -> list[str]:
     if "subject" not in claims:
         counts = {item["item"]: item["count"] for item in claims["erased"]}
-        say(
+        return [
             f"Valid: tenant {claims['tenant']} was erased on {claims['erased_at']}, with "
             f"{counts['subjects']} subjects."
-        )
-        return
+        ]
     content = "what was held of" if claims["held"] else "that nothing was held of"
     verb = "erased" if claims["held"] else "stated"
-    say(f"Valid: tenant {claims['tenant']} {verb} {content} a subject on {claims['erased_at']}.")
-    say(f"The subject's pseudonym is {claims['subject']}.")
+    return [
+        f"Valid: tenant {claims['tenant']} {verb} {content} a subject on {claims['erased_at']}.",
+        f"The subject's pseudonym is {claims['subject']}.",
+    ]
 
 
 def _state(key: ApiKey) -> str:
@@ -307,19 +307,8 @@ def _state(key: ApiKey) -> str:
     return "valid" if key.expires_at is None else f"valid until {key.expires_at:%Y-%m-%d}"
 
 
-def _iso(moment: datetime | None) -> str | None:
-    return None if moment is None else moment.isoformat(timespec="seconds")
-
-
 def _described(key: ApiKey) -> dict[str, Any]:
-    return {
-        "prefix": key.prefix,
-        "tenant": key.tenant,
-        "rights": sorted(key.rights),
-        "lowest_level": key.lowest_level,
-        "label": key.label,
-        "created_at": _iso(key.created_at),
-        "expires_at": _iso(key.expires_at),
-        "revoked_at": _iso(key.revoked_at),
-        "last_used_at": _iso(key.last_used_at),
-    }
+    names = ("prefix", "tenant", "lowest_level", "label")
+    times = ("created_at", "expires_at", "revoked_at", "last_used_at")
+    facts = {name: getattr(key, name) for name in (*names, *times)}
+    return {**facts, "rights": sorted(key.rights)}

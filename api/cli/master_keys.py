@@ -1,28 +1,31 @@
-"""``veilface keys master``, ``rotate`` and ``rewrap``: the keys that everything is sealed under."""
+"""``veilface keys master``, ``rotate``, ``rewrap``, ``renew``: what everything is sealed under."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from api.cli.console import emit, progress, say
+from api.cli.console import progress
 from api.cli.errors import CommandError, UsageError
-from api.cli.options import STORE, AsJson, takes_settings
+from api.cli.options import STORE
+from api.cli.results import Result, reports
+from api.http.audit import operator
 from api.service.opening import file_sealer, open_keyring, open_store, prepare_database
 from api.settings import Settings
 from templates.contract.document import Contract
 from templates.decoys import DecoyPool, load_source
 from templates.keys.sealing import MasterKeyring
 from templates.store import TemplateStore
+from templates.store.identifiers import utc_now
 
 FILES = (*STORE, "contract_file", "decoys_file")
 
 
-@takes_settings("data_dir", "master_key_file")
-def master(*, settings: Settings, as_json: AsJson = False) -> None:
+@reports("data_dir", "master_key_file")
+def master(*, settings: Settings) -> Result:
     """Create the master key file; an existing one is never touched.
 
     `serve` and `calibrate` create it on their first run. Keep a copy in a safe place, apart from
@@ -32,10 +35,10 @@ def master(*, settings: Settings, as_json: AsJson = False) -> None:
     """
     path = settings.resolved_master_key_file
     keyring = MasterKeyring.create(path)
-    if as_json:
-        emit({"file": str(path), "key_id": keyring.current})
-    else:
-        say(f"{path}: master key {keyring.current}, readable by you only. Keep a copy elsewhere.")
+    return Result(
+        {"file": path, "key_id": keyring.current},
+        f"{path}: master key {keyring.current}, readable by you only. Keep a copy elsewhere.",
+    )
 
 
 Retire = Annotated[
@@ -44,8 +47,8 @@ Retire = Annotated[
 ]
 
 
-@takes_settings(*FILES)
-def rotate(*, settings: Settings, retire: Retire = False, as_json: AsJson = False) -> None:
+@reports(*FILES)
+def rotate(*, settings: Settings, retire: Retire = False) -> Result:
     """Put a new master key in force and rewrap everything under it.
 
     Needs: the database, the key file, and the contract and decoys files that it sealed. The
@@ -58,11 +61,11 @@ def rotate(*, settings: Settings, retire: Retire = False, as_json: AsJson = Fals
     keyring = open_keyring(settings)
     with opened_store(settings, keyring) as store:
         add_key(settings, store)
-        _rewrap(settings, keyring, store, retire=retire, as_json=as_json)
+        return _rewrap(settings, keyring, store, retire=retire)
 
 
-@takes_settings(*FILES)
-def rewrap(*, settings: Settings, retire: Retire = False, as_json: AsJson = False) -> None:
+@reports(*FILES)
+def rewrap(*, settings: Settings, retire: Retire = False) -> Result:
     """Finish a rotation: rewrap whatever an older master key still wraps.
 
     Safe to run again, and after an interrupted `rotate`.
@@ -73,7 +76,80 @@ def rewrap(*, settings: Settings, retire: Retire = False, as_json: AsJson = Fals
         _require_file(settings, "drop the old key where they come from")
     keyring = open_keyring(settings)
     with opened_store(settings, keyring) as store:
-        _rewrap(settings, keyring, store, retire=retire, as_json=as_json)
+        return _rewrap(settings, keyring, store, retire=retire)
+
+
+@reports(*FILES, "export_key_file")
+def renew(
+    archive: Annotated[Path, typer.Argument(help="New file for the audit log so far.")],
+    *,
+    settings: Settings,
+) -> Result:
+    """Renew every secret of the deployment, after its database and master key were stolen.
+
+    Stop the service first, and start it again afterwards. Puts a new master key in force and drops
+    the old one; moves the audit log into a signed archive and begins a new chain; draws the keys of
+    receipts, exports and API keys anew, and every tenant's rotation key. Then lists what is left to
+    people: who enrolls again, and which API keys are replaced. Master keys that do not come from a
+    file: put a new one in front where they come from first, and drop the old one afterwards.
+
+    Example: `veilface keys renew audit-before-theft.jsonl`
+    """
+    keyring = open_keyring(settings)
+    if not is_from_file(settings) and len(keyring.key_ids) < 2:
+        raise UsageError(
+            "the master keys do not come from a file: put a new key in front where they come "
+            "from, and run this again"
+        )
+    with opened_store(settings, keyring) as store:
+        if is_from_file(settings):
+            add_key(settings, store)
+        rewrapped = rewrap_all(settings, keyring, store)
+        renewed = store.renew_secrets(archive, by=operator())
+        dropped = retire_older(settings, store, rewrapped) if is_from_file(settings) else 0
+        enroll_again = {}
+        for tenant in store.tenants.all():
+            store.rerotation.begin(tenant.name, by=operator())
+            enroll_again[tenant.name] = list(store.rerotation.subjects_of_old_epochs(tenant.name))
+        replace = [key.prefix for key in store.api_keys.all() if key.is_valid_at(utc_now())]
+        anchor = str(store.audit_log.head())
+    text = [
+        f"Master key {rewrapped.key_id} is in force: {rewrapped.changed} keys and secrets wrapped "
+        f"again, {dropped} older keys dropped.",
+        *(f"Sealed again: {file}" for file in rewrapped.files),
+        f"Moved {renewed.archive.lines} lines of the audit log into {archive}; "
+        f"{renewed.receipts} receipts signed again.",
+        *(
+            f"API key {prefix} was made up or altered: it is good for nothing."
+            for prefix in renewed.refused
+        ),
+        "\nLeft to do:",
+        f"- Keep this anchor of the audit log elsewhere: {anchor}",
+        "- Give everybody who verifies receipts `GET /v1/contract` anew: it names the new key.",
+    ]
+    for name, subjects in enroll_again.items():
+        if subjects:
+            text.append(f"- Enroll these subjects of tenant {name} again, with new photos:")
+        text += [f"    {subject}" for subject in subjects]
+        text.append(f"  Then run `veilface keys rotate-tenant --tenant {name} --stolen --finish`.")
+    if replace:
+        text.append("- Replace these API keys, and revoke those that nobody knows:")
+    text += [f"    veilface keys replace {prefix} --grace-hours 0" for prefix in replace]
+    if settings.export_key_file is not None:
+        text.append("- Make another export key file, if it was stolen too.")
+    if not is_from_file(settings):
+        text.append("- Drop the older master keys where they come from.")
+    text.append("- Destroy copies of the old master key; backups from before can be read with it.")
+    facts = {
+        **_facts(rewrapped, dropped),
+        "archived_lines": renewed.archive.lines,
+        "receipts_signed_again": renewed.receipts,
+        "api_keys_refused": list(renewed.refused),
+        "anchor": anchor,
+        "enroll_again": enroll_again,
+        "replace_api_keys": replace,
+    }
+    return Result(facts, text)
 
 
 @contextmanager
@@ -150,33 +226,29 @@ def retire_older(settings: Settings, store: TemplateStore, rewrapped: Rewrapped)
 
 
 def _rewrap(
-    settings: Settings,
-    keyring: MasterKeyring,
-    store: TemplateStore,
-    *,
-    retire: bool,
-    as_json: bool,
-) -> None:
+    settings: Settings, keyring: MasterKeyring, store: TemplateStore, *, retire: bool
+) -> Result:
     rewrapped = rewrap_all(settings, keyring, store)
-    current, changed, files = rewrapped.key_id, rewrapped.changed, rewrapped.files
     dropped = retire_older(settings, store, rewrapped) if retire else 0
-    if as_json:
-        emit(
-            {
-                "key_id": current,
-                "rewrapped": changed,
-                "resealed_files": [str(file) for file in files],
-                "retired": dropped,
-            }
-        )
-        return
-    say(f"Master key {current} is in force: {changed} keys and secrets wrapped again.")
-    for file in files:
-        say(f"Sealed again: {file}")
+    text = [
+        f"Master key {rewrapped.key_id} is in force: {rewrapped.changed} keys and secrets wrapped "
+        "again.",
+        *(f"Sealed again: {file}" for file in rewrapped.files),
+    ]
     if dropped:
-        say(f"Retired {dropped} older keys.")
+        text.append(f"Retired {dropped} older keys.")
     elif len(keyring.key_ids) > 1:
-        say("The older keys are still in the file; `--retire` drops them.")
+        text.append("The older keys are still in the file; `--retire` drops them.")
+    return Result(_facts(rewrapped, dropped), text)
+
+
+def _facts(rewrapped: Rewrapped, dropped: int) -> dict[str, Any]:
+    return {
+        "key_id": rewrapped.key_id,
+        "rewrapped": rewrapped.changed,
+        "resealed_files": rewrapped.files,
+        "retired": dropped,
+    }
 
 
 def _seal_files_again(settings: Settings, keyring: MasterKeyring) -> list[Path]:

@@ -12,7 +12,6 @@ import typer
 
 from api.cli.console import demo_notice, message, say
 from api.cli.errors import CommandError
-from api.cli.new_key import show_once
 from api.cli.options import takes_settings
 from api.cli.verdict import private_mode_weakness, verdict_lines
 from api.limits.rates import RateLimits
@@ -143,7 +142,7 @@ def _show_first_key(store: TemplateStore, settings: Settings) -> None:
     made = store.api_keys.bootstrap(tenant=settings.default_tenant)
     if made is not None:
         said = f"API key with all rights of tenant {settings.default_tenant}, shown only now:"
-        show_once(store, made, f"{said}\n{made.token}")
+        say(f"{said}\n{made.token}")
 
 
 def free_port(host: str, port: int, *, option: str = "") -> int:

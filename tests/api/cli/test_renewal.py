@@ -96,7 +96,7 @@ def test_it_renews_all_and_says_what_is_left_to_do(used: tuple[Path, dict[str, A
         anchor = str(store.audit_log.head())
     for said in (
         f"Keep this anchor of the audit log elsewhere: {anchor}",
-        "Enroll these 2 subjects of tenant default again, with new photos:\n    ada\n    bob\n",
+        "Enroll these subjects of tenant default again, with new photos:\n    ada\n    bob\n",
         "veilface keys rotate-tenant --tenant default --stolen --finish",
         f"veilface keys replace {key.prefix} --grace-hours 0",
         "1 receipts signed again",
@@ -106,28 +106,6 @@ def test_it_renews_all_and_says_what_is_left_to_do(used: tuple[Path, dict[str, A
     assert verify_archive(data / "archive.jsonl", before).lines > 0
     # The log goes on where the archive ends.
     assert run("audit-log", "verify", "--anchor", anchor, "--data-dir", data).status == 0
-
-
-def test_what_was_tampered_with_is_not_made_good(used: tuple[Path, dict[str, Any]]) -> None:
-    data, known = used
-    with opened(data) as store:
-        spoil(store, "UPDATE api_keys SET rights = 'admin'")
-        spoil(store, "UPDATE receipts SET body = replace(body, 'false', 'true')")
-    ran = renew(data, "--json")
-    assert ran.status == 0, ran.stderr
-    assert ran.json["api_keys_refused"] == [known["token"][3:15]]
-    assert ran.json["receipts_signed_again"] == 0
-    with opened(data) as store:
-        assert store.api_keys.verify(known["token"]) is None
-        spoil(store, "UPDATE audit_log SET outcome = 'accept'")
-    (data / "archive.jsonl").unlink()
-    refused = renew(data)
-    assert refused.status == 1
-    assert "nothing was archived" in refused.stderr
-
-
-def spoil(store: TemplateStore, statement: str) -> None:
-    store.database.write(lambda connection: connection.execute(sa.text(statement)))
 
 
 def test_master_keys_of_a_variable_are_put_there_first(

@@ -1,0 +1,148 @@
+"""What a command found, and the one place that shows it: as text, or as JSON with ``--json``.
+
+A command is a function from flags to a :class:`Result`. The decorator :func:`reports` gives it its
+flags for settings and ``--json``, shows the result, and sets the exit status.
+"""
+
+import dataclasses
+import functools
+import inspect
+import json
+import tomllib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from api.cli.console import message, print_rich, say
+from api.cli.errors import UsageError
+from api.cli.options import AsJson, takes_settings
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table for a person; every cell is shown as ``str`` writes it."""
+
+    title: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[object]]
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a command found.
+
+    Parameters
+    ----------
+    facts
+        What ``--json`` writes: a mapping, a list or a dataclass. It may hold paths, times, and
+        objects with a method ``to_json``.
+    text
+        What a person reads instead: lines and tables, in order.
+    error
+        Why the exit status is 1, on stderr after either; None where it is 0.
+    """
+
+    facts: Any
+    text: str | Sequence[str | Table] = ()
+    error: str | None = None
+
+
+def as_json(value: Any) -> str:
+    """Write facts as JSON."""
+    return json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False, default=_plain)
+
+
+def _plain(value: Any) -> Any:
+    if hasattr(value, "to_json"):
+        return value.to_json()
+    if dataclasses.is_dataclass(value):
+        return {part.name: getattr(value, part.name) for part in dataclasses.fields(value)}
+    if isinstance(value, datetime):
+        return value.isoformat(timespec="seconds")
+    if isinstance(value, Path):
+        return str(value)
+    raise TypeError(f"{type(value).__name__} is not written as JSON")
+
+
+def present(result: Result, *, json: bool) -> None:
+    """Show a result; raises :class:`typer.Exit` with status 1 where it is an error."""
+    if json:
+        say(as_json(result.facts))
+    else:
+        for part in [result.text] if isinstance(result.text, str) else result.text:
+            if isinstance(part, str):
+                say(part)
+            else:
+                _show(part)
+    if result.error is not None:
+        message(f"error: {result.error}")
+        raise typer.Exit(1)
+
+
+def _show(table: Table) -> None:
+    from rich.table import Table as Listing
+
+    listing = Listing(title=table.title, title_justify="left", title_style="bold")
+    for column in table.columns:
+        listing.add_column(column, overflow="fold")
+    for row in table.rows:
+        listing.add_row(*map(str, row))
+    print_rich(listing)
+
+
+def reports(*settings: str) -> Callable[[Callable[..., Result]], Callable[..., None]]:
+    """Give a command that returns a :class:`Result` flags for settings, and ``--json``."""
+
+    def decorate(command: Callable[..., Result]) -> Callable[..., None]:
+        inner = takes_settings(*settings)(command) if settings else command
+
+        @functools.wraps(command)
+        def run(*, as_json: bool, **given: Any) -> None:
+            present(inner(**given), json=as_json)
+
+        own = [
+            parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY)
+            for parameter in inspect.signature(inner).parameters.values()
+        ]
+        flag = inspect.Parameter(
+            "as_json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=AsJson
+        )
+        # Typer reads these two; the wrapped command would show it other parameters.
+        run.__signature__ = inspect.Signature([*own, flag])  # type: ignore[attr-defined]
+        run.__annotations__ = {each.name: each.annotation for each in (*own, flag)}
+        del run.__wrapped__
+        return run
+
+    return decorate
+
+
+def _read_plan(ctx: typer.Context, file: Path | None) -> Path | None:
+    """Take a plan's values as the defaults of the flags that it names."""
+    if file is None:
+        return None
+    try:
+        values: Mapping[str, Any] = tomllib.loads(file.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise UsageError(f"--plan {file} cannot be read as TOML: {error}") from None
+    values = {name.replace("-", "_"): value for name, value in values.items()}
+    known = {str(each.name) for each in ctx.command.params} - {"plan"}
+    unknown = sorted(set(values) - known)
+    if unknown:
+        raise UsageError(f"--plan {file} names no option of this command: {', '.join(unknown)}")
+    ctx.default_map = {**(ctx.default_map or {}), **values}
+    return file
+
+
+Plan = Annotated[
+    Path | None,
+    typer.Option(
+        "--plan",
+        is_eager=True,
+        callback=_read_plan,
+        help="A TOML file with options, named as their flags; flags that are given win.",
+    ),
+]
