@@ -22,10 +22,10 @@ import yaml
 from psycopg import sql
 
 from tests.api.deployment import bearer, deploy, images, photo
+from tests.pages import block_under
 from tests.patience import PATIENCE_S, wait_until
 from tests.reliability.cluster import Cluster, NoPostgres
 from tests.reliability.hosts import Network
-from tests.test_docs_snippets import find
 
 pytestmark = pytest.mark.long
 
@@ -35,7 +35,7 @@ SERVICES = COMPOSE["services"]
 SECRETS = SERVICES["veilface"]["secrets"]
 DOCKERFILE = (ROOT / "deploy" / "Dockerfile").read_text()
 BIN = Path(sys.executable).parent
-PREPARE = find("docs/deployment.md", "DEPLOY=/opt/veilface-deploy").code
+PREPARE = block_under("deployment.md", "A container", "sh")
 POSTGRES_PORT = 5432
 
 # A root like this machine's, but with what is mounted: SOURCE TARGET … -- PROGRAM ARGUMENT …

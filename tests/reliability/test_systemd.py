@@ -11,16 +11,16 @@ import httpx
 import pytest
 
 from tests.api.deployment import bearer, deploy, images, photo
+from tests.pages import block_under
 from tests.patience import PATIENCE_S, wait_until
 from tests.reliability.hosts import Network
 from tests.reliability.service import ROOT
 from tests.reliability.systemd import Machine
-from tests.test_docs_snippets import find
 
 pytestmark = pytest.mark.long
 
-SETTINGS = find("docs/deployment.md", 'pack = "/srv/veilface/buffalo_l"').code
-INSTALL = find("docs/deployment.md", "python3 -m venv /opt/veilface").code
+SETTINGS = block_under("deployment.md", "systemd", "toml")
+INSTALL = block_under("deployment.md", "systemd", "sh")
 UNIT = (ROOT / "deploy" / "veilface.service").read_text()
 PYTHON = "/opt/veilface/bin/python"
 URL = "http://127.0.0.1:8421"
