@@ -2,8 +2,8 @@
 
 Pillow reads every part of a head, one after the other: a file of 10 MiB may hold a million empty
 parts, ten thousand profiles that unpack to a megabyte each, or EXIF in half a million pieces,
-which it joins one by one. So a decoder gets a file without metadata, in a bounded number of parts, and the
-orientation, which is the only metadatum that is used, is read here.
+which it joins one by one. So a decoder gets a file without metadata, in a bounded number of parts,
+and the orientation, which is the only metadatum that is used, is read here.
 """
 
 import re
