@@ -92,7 +92,6 @@ wheels: | $(UV)
 	$(UV) venv --quiet --python '>=3.11' .bootstrap/alone
 	$(UV) pip install --quiet --python .bootstrap/alone/bin/python --constraint requirements.lock dist/wheels/veilface_client-*.whl
 	.bootstrap/alone/bin/python -I -W error -c "import veilface_client, sys; sys.exit('api' in sys.modules)"
-	.bootstrap/alone/bin/veilface-client --version
 
 # The wheel with the oldest libraries that pyproject.toml allows, where a folder `api` would be imported instead of ours.
 lowest: wheels

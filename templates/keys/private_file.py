@@ -6,7 +6,6 @@ service could not read it afterwards, and a user could have chosen the place.
 
 import errno
 import os
-import pwd
 import secrets
 import stat
 from collections.abc import Callable
@@ -70,6 +69,8 @@ def refuse_another_users(path: Path) -> None:
     existing = next(place for place in (path, *path.parents) if os.path.lexists(place))
     owner = existing.lstat().st_uid
     if owner != 0:
+        import pwd  # not on Windows, where clients import what imports this
+
         try:
             name = f"{pwd.getpwuid(owner).pw_name} ({owner})"
         except KeyError:

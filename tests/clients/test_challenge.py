@@ -1,6 +1,5 @@
-"""Both clients answer a challenge of a running service that asks for one."""
+"""The client answers a challenge of a running service that asks for one."""
 
-import asyncio
 from collections.abc import Iterator
 
 import pytest
@@ -9,7 +8,7 @@ from tests.api.deployment import deploy
 from tests.clients.conftest import Running, started
 from tests.heads import performed
 from tests.marked_heads import frame, write_marked_pack
-from veilface_client import AsyncClient, Client, Forbidden, InvalidRequest, Unauthorized
+from veilface_client import Client, Forbidden, InvalidRequest, Unauthorized
 
 
 @pytest.fixture(scope="module")
@@ -38,14 +37,3 @@ def test_a_challenge_is_answered_once(asking: Running) -> None:
         still = client.verify("anna", [frame()] * 5, challenge=client.challenge())
         assert not still
         assert (still.reason, still.liveness_failure) == ("liveness", "no_turn")
-
-
-def test_a_challenge_is_answered_asynchronously(asking: Running) -> None:
-    async def accepted() -> bool:
-        async with AsyncClient(asking.url, asking.deployment.token) as client:
-            await client.enroll("ben", frame(person=2))
-            challenge = await client.challenge()
-            frames = [frame(name, 2) for name in performed(challenge.movements)]
-            return bool(await client.verify("ben", frames, challenge=challenge))
-
-    assert asyncio.run(accepted())

@@ -91,19 +91,10 @@ def test_an_enrollment_replaces_what_it_may(service: Running, token: str) -> Non
         assert refused.value.details == {"template_id": first.template_id}
         second = client.enroll("ida", photo(1), replace=first.template_id)
         for wrong in ("", '"', "*", "a b"):
-            with pytest.raises(ValueError, match="template_id of an enrollment"):
+            with pytest.raises(ValueError, match="replace is True, False, or"):
                 client.enroll("ida", photo(1), replace=wrong)
-
-    async def asynchronously() -> str:
-        async with AsyncClient(service.url, token) as client:
-            for replace in (False, first.template_id):
-                with pytest.raises(EnrollmentConflict):
-                    await client.enroll("ida", photo(1), replace=replace)
-            third = await client.enroll("ida", photo(1), replace=second.template_id)
-            await client.erase("ida")
-            return third.template_id
-
-    assert len({first.template_id, second.template_id, asyncio.run(asynchronously())}) == 3
+        assert second.template_id != first.template_id
+        client.erase("ida")
 
 
 def test_an_enrollment_that_needs_its_holders_key(service: Running, token: str) -> None:
@@ -121,17 +112,6 @@ def test_an_enrollment_that_needs_its_holders_key(service: Running, token: str) 
                 client.verify("kept", photo(7, 1), holder_key=no_key)  # type: ignore[arg-type]
             assert key.hex()[:8] not in str(caught.value)
         client.erase("kept")
-
-    async def asynchronously() -> list[bool]:
-        async with AsyncClient(service.url, token) as client:
-            await client.enroll("kept", photo(7), holder_key=key)
-            decisions = [
-                await client.verify("kept", photo(7, 1), holder_key=sent) for sent in (key, other)
-            ]
-            await client.erase("kept")
-        return [decision.accepted for decision in decisions]
-
-    assert asyncio.run(asynchronously()) == [True, False]
 
 
 def test_export_and_import(service: Running, token: str) -> None:
@@ -181,7 +161,7 @@ def test_a_lockout_and_its_reset(service: Running, token: str) -> None:
         client.erase("dora")
 
 
-def test_every_call_asynchronously(service: Running, token: str, tmp_path: Path) -> None:
+def test_asynchronously(service: Running, token: str, tmp_path: Path) -> None:
     path = tmp_path / "emil.png"
     path.write_bytes(photo(7))
 
@@ -193,18 +173,12 @@ def test_every_call_asynchronously(service: Running, token: str, tmp_path: Path)
                 client.verify("emil", [photo(7, 2), path]), client.verify("emil", photo(8))
             )
             assert [bool(each) for each in answers] == [True, False]
-            assert (await client.describe("emil")).photos == 2
-            assert "emil" in [each.subject_id async for each in client.subjects(page_size=1)]
-            # An acceptance forgets the failures: of the two above either may have been the last.
-            assert not await client.verify("emil", photo(8))
-            assert (await client.lockout("emil")).consecutive_failures in (1, 2)
-            await client.reset_lockout("emil")
-            exported = await client.export("emil")
-            assert (await client.import_(exported)).replaced
-            contract, generator = await asyncio.gather(client.contract(), client.generator())
-            assert contract.binding["decoy_source_id"] == generator.source_id
-            assert (await client.ready()).status == "ok"
-            assert (await client.erase("emil")).held
+            await client.enroll("fred", path)
+            found = [each.subject_id async for each in client.subjects(page_size=1)]
+            assert {"emil", "fred"} <= set(found)
+            assert len(set(found)) == len(found)
+            for subject in ("emil", "fred"):
+                assert (await client.erase(subject)).held
             with pytest.raises(NotEnrolled):
                 await client.describe("emil")
 
@@ -301,15 +275,12 @@ def test_a_service_that_never_answers() -> None:
     assert failed.value.sent
 
 
-def test_answers_that_make_no_sense() -> None:
+def test_a_generator_without_its_name() -> None:
     def answer(request: httpx.Request) -> httpx.Response:
-        if request.url.path == "/v1/subjects":
-            body = {"subjects": [], "next_cursor": "same", "request_id": "r"}
-            return httpx.Response(200, json=body)
         return httpx.Response(200, content=b"generator")
 
-    with Client("http://x", "vf_x", transport=httpx.MockTransport(answer)) as client:
-        with pytest.raises(UnexpectedAnswer, match="next one"):
-            list(client.subjects())
-        with pytest.raises(UnexpectedAnswer, match="X-Decoy-Source-ID"):
-            client.generator()
+    with (
+        Client("http://x", "vf_x", transport=httpx.MockTransport(answer)) as client,
+        pytest.raises(UnexpectedAnswer, match="X-Decoy-Source-ID"),
+    ):
+        client.generator()

@@ -8,10 +8,11 @@ from pathlib import Path
 
 import pytest
 
+from api.http.errors import ERROR_CODES
 from tests.api.deployment import photo
 from tests.clients.conftest import VEILFACE, Running
 from veilface_client import Client
-from veilface_client.errors import FAMILIES
+from veilface_client.errors import error_class
 
 ROOT = Path(__file__).resolve().parents[2]
 CLIENT, DISTRIBUTION = PAGES = ("docs/client.md", "clients/python/README.md")
@@ -80,28 +81,11 @@ def test_the_same_from_the_shell(service: Running, newcomer: tuple[Path, dict[st
     assert '"decision":"accept"' in done.stdout.replace(": ", ":")
 
 
-@pytest.mark.parametrize("page", [CLIENT, DISTRIBUTION])
-def test_the_command_as_the_pages_use_it(
-    page: str, service: Running, newcomer: tuple[Path, dict[str, str]]
-) -> None:
-    folder, env = newcomer
-    (script,) = (block for block in blocks(page, "sh") if block.startswith("veilface-client "))
-    done = subprocess.run(
-        ["bash", "-euo", "pipefail", "-c", script],
-        cwd=folder,
-        env=env | {"VEILFACE_URL": service.url},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stderr
-    enrolled, verified = done.stdout.splitlines()
-    assert enrolled.startswith("Enrolled anna from 2 photos")
-    assert verified == "accept: anna, level fmr-1e-3"
-
-
 def test_the_table_of_classes_is_that_of_the_code() -> None:
     text = (ROOT / CLIENT).read_text(encoding="utf-8")
     table = text.split("| class | codes |")[1].split("\n\n")[0]
     rows = re.findall(r"^\| `(\w+)`.*? \| (.*) \|$", table, flags=re.MULTILINE)
     stated = {code: name for name, codes in rows for code in re.findall(r"`(\w+)`", codes)}
-    assert stated == {code: kind.__name__ for code, kind in FAMILIES.items()}
+    assert stated == {
+        code: error_class(code, error.status).__name__ for code, error in ERROR_CODES.items()
+    }

@@ -29,7 +29,6 @@ def test_enrolled_and_verified_without_a_photo_leaving(packless: Running, tmp_pa
             proxy.url,
             packless.deployment.token,
             pack=packless.pack,
-            retries=Retries(first_s=0.01),
         ) as client,
     ):
         client.contract()

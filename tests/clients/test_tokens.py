@@ -1,12 +1,10 @@
 """A server asks for tokens with its key, and whoever holds one is let in once."""
 
-import asyncio
-
 import pytest
 
 from tests.api.deployment import photo
 from tests.clients.conftest import Running, service
-from veilface_client import AsyncClient, Client, EnrollmentConflict, Forbidden, Unauthorized
+from veilface_client import Client, EnrollmentConflict, Forbidden, Unauthorized
 
 __all__ = ["service"]
 
@@ -35,18 +33,6 @@ def test_a_token_is_used_once_and_its_outcome_is_told(service: Running) -> None:
                     page.verify("tina", photo(person, 3))
             outcome = server.token_outcome("tina", issued.token_id)
             assert (bool(outcome), outcome.level) == (person == 1, "fmr-1e-3")
-
-
-def test_the_same_asynchronously(service: Running) -> None:
-    async def accepted() -> bool:
-        async with AsyncClient(service.url, service.deployment.token) as server:
-            await server.enroll("toby", photo(3))
-            issued = await server.create_token("toby", "verify")
-            async with AsyncClient(service.url, issued.token) as page:
-                await page.verify("toby", photo(3, 3))
-            return bool(await server.token_outcome("toby", issued.token_id))
-
-    assert asyncio.run(accepted())
 
 
 def test_what_cannot_be_a_token_is_refused_here(service: Running) -> None:

@@ -12,7 +12,7 @@
     │   │   └── NotEnrolled
     │   ├── Conflict
     │   │   ├── ContractMismatch
-    │   │   ├── EnrollmentConflict
+    │   │   └── EnrollmentConflict
     │   ├── LockedOut           wait .retry_after, and offer another factor
     │   ├── RateLimited
     │   └── ServerFailed        a defect of the service
@@ -26,12 +26,12 @@ A code that this version does not know gives the class of its status. No error r
 a photo, or a template.
 """
 
-from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import httpx
 
-from veilface_client.lifts import Enrollable, Probe
+if TYPE_CHECKING:
+    from veilface_client.results import Lift
 
 
 class VeilfaceError(Exception):
@@ -45,7 +45,7 @@ class VeilfaceError(Exception):
         not fit the service's contract.
     """
 
-    lift: Enrollable | Probe | None = None
+    lift: "Lift | None" = None
 
 
 class ServiceError(VeilfaceError):
@@ -74,16 +74,16 @@ class ServiceError(VeilfaceError):
         message: str,
         *,
         status: int,
-        details: Mapping[str, Any] | None = None,
-        request_id: str | None = None,
-        retry_after: float | None = None,
+        details: dict[str, Any],
+        request_id: str | None,
+        retry_after: float | None,
     ) -> None:
-        named = code if request_id is None else f"{code}, request {request_id}"
-        super().__init__(f"{message} ({named})")
+        request = "" if request_id is None else f", request {request_id}"
+        super().__init__(f"{message} ({code}{request})")
         self.code = code
         self.status = status
         self.message = message
-        self.details: dict[str, Any] = dict(details or {})
+        self.details = details
         self.request_id = request_id
         self.retry_after = retry_after
 
@@ -141,14 +141,7 @@ class Unavailable(ServerFailed):
 
 
 class ConnectionFailed(VeilfaceError):
-    """No answer arrived.
-
-    Attributes
-    ----------
-    sent
-        False if the connection was never made: the service has not seen the request. True if it may
-        have done what was asked.
-    """
+    """No answer arrived; where ``sent`` is true, the service may have done what was asked."""
 
     def __init__(self, message: str, *, sent: bool) -> None:
         super().__init__(message)
@@ -160,13 +153,7 @@ class UnexpectedAnswer(VeilfaceError):
 
 
 class LiftFailed(VeilfaceError):
-    """No template was made: photos, pack, contract or decoys do not serve.
-
-    Attributes
-    ----------
-    message
-        What is wrong, and the remedy.
-    """
+    """No template was made: ``message`` says which photo, pack, contract or decoys do not serve."""
 
     def __init__(self, message: str) -> None:
         super().__init__(message)
@@ -177,38 +164,18 @@ class LiftUnavailable(LiftFailed):
     """The package ``veilface`` is not installed, or cannot be imported in this process."""
 
 
-FAMILIES: dict[str, type[ServiceError]] = {
-    "malformed_request": InvalidRequest,
-    "unsupported_image": PhotoRefused,
-    "invalid_template": InvalidRequest,
-    "invalid_embedding": InvalidRequest,
-    "unauthorized": Unauthorized,
-    "replayed": Unauthorized,
-    "forbidden": Forbidden,
+_BY_CODE: dict[str, type[ServiceError]] = {
     "not_enrolled": NotEnrolled,
-    "not_found": NotFound,
-    "method_not_allowed": InvalidRequest,
     "contract_mismatch": ContractMismatch,
     "enrollment_conflict": EnrollmentConflict,
+    "unsupported_image": PhotoRefused,
     "image_too_large": PhotoRefused,
-    "request_too_large": InvalidRequest,
-    "too_many_images": InvalidRequest,
     "no_face": PhotoRefused,
     "multiple_faces": PhotoRefused,
     "face_too_small": PhotoRefused,
     "low_quality": PhotoRefused,
     "inconsistent_images": PhotoRefused,
-    "uncalibrated": InvalidRequest,
-    "validation_failed": InvalidRequest,
-    "locked_out": LockedOut,
-    "rate_limited": RateLimited,
-    "internal_error": ServerFailed,
-    "model_unavailable": Unavailable,
-    "store_unavailable": Unavailable,
-    "overloaded": Unavailable,
 }
-"""Every error code of the service, with its class."""
-
 _BY_STATUS: dict[int, type[ServiceError]] = {
     401: Unauthorized,
     403: Forbidden,
@@ -222,29 +189,33 @@ _BY_STATUS: dict[int, type[ServiceError]] = {
 }
 
 
+def error_class(code: str, status: int) -> type[ServiceError]:
+    """Return the class of an error code, or of the status where the code has none of its own."""
+    fallback = InvalidRequest if status < 500 else ServerFailed
+    return _BY_CODE.get(code) or _BY_STATUS.get(status, fallback)
+
+
 def error_of(response: httpx.Response) -> VeilfaceError:
-    """Give an answer that is no success its exception."""
+    """Return the exception of an answer that is no success."""
     status = response.status_code
     if status < 400:
         return UnexpectedAnswer(f"the service never answers HTTP {status}; is the URL right?")
-    fallback = _BY_STATUS.get(status, InvalidRequest if status < 500 else ServerFailed)
     header = response.headers.get("Retry-After", "")
-    retry_after = float(header) if header.isascii() and header.isdigit() else None
     try:
         body = response.json()
-        code, message = body["error"]["code"], body["error"]["message"]
-        details, request_id = body["error"].get("details", {}), body.get("request_id")
+        error, request_id = body["error"], body.get("request_id")
+        code, message, details = error["code"], error["message"], error.get("details", {})
         if not (isinstance(code, str) and isinstance(message, str) and isinstance(details, dict)):
             raise TypeError
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         # A proxy's page may repeat the request's headers: nothing of it is passed on.
-        said = f"HTTP {status}, without an error of the service"
-        return fallback(f"http_{status}", said, status=status, retry_after=retry_after)
-    return FAMILIES.get(code, fallback)(
+        code, message = f"http_{status}", f"HTTP {status}, without an error of the service"
+        details, request_id = {}, None
+    return error_class(code, status)(
         code,
         message,
         status=status,
         details=details,
         request_id=request_id if isinstance(request_id, str) else None,
-        retry_after=retry_after,
+        retry_after=float(header) if header.isascii() and header.isdigit() else None,
     )

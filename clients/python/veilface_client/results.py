@@ -1,19 +1,59 @@
-"""What the service answers, as frozen values.
+"""What the service answers, and what a private client lifts, as frozen values.
 
 Fields that this version does not know are ignored, so that it reads the answers of later ones.
 """
 
 import os
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Any, Literal, Self
 
 import httpx
-from pydantic import AwareDatetime, Field, StringConstraints, ValidationError
+from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, ValidationError
 
 from veilface_client.errors import UnexpectedAnswer
-from veilface_client.lifts import Value
 
-Hex = Annotated[str, StringConstraints(pattern=r"\A[0-9a-f]{64}\z")]
+
+class Value(BaseModel):
+    """A frozen value."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    @classmethod
+    def read(cls, response: httpx.Response) -> Self:
+        """Read an answer.
+
+        Raises
+        ------
+        UnexpectedAnswer
+            It lacks a field, or has another type. The text names fields, and no value.
+        """
+        try:
+            return cls.model_validate_json(response.content)
+        except ValidationError as error:
+            fields = sorted({".".join(map(str, each["loc"])) or "body" for each in error.errors()})
+            raise UnexpectedAnswer(
+                f"the answer does not fit {cls.__name__}: {', '.join(fields)}"
+            ) from None
+
+
+class Lift(Value):
+    """What a client has lifted: no photo, and no embedding."""
+
+    template: bytes
+    contract_id: str
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} of {len(self.template)} bytes>"
+
+    __str__ = __repr__
+
+
+class Probe(Lift):
+    """A lifted probe. Use it once for each attempt it is meant for."""
+
+
+class Enrollable(Lift):
+    """A template that enrolls, lifted and not yet (or perhaps) sent."""
 
 
 class Answer(Value):
@@ -151,15 +191,12 @@ class Unlocked(Answer):
     lifted: bool
 
 
-class SignedText(Value):
-    """The text of a receipt, and its Ed25519 signature in base64."""
-
-    body: str
-    signature: str
-
-
 class _Verbatim(Answer):
     raw: bytes = Field(default=b"", repr=False, exclude=True)
+
+    @classmethod
+    def read(cls, response: httpx.Response) -> Self:
+        return super().read(response).model_copy(update={"raw": response.content})
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the answer to a file, byte for byte."""
@@ -173,7 +210,7 @@ class Receipt(_Verbatim):
     False where SQLite's log still holds old pages, which a later purge removes.
     """
 
-    receipt: SignedText
+    receipt: dict[str, str]
     claims: dict[str, Any]
     log_purged: bool
 
@@ -183,25 +220,17 @@ class Receipt(_Verbatim):
         return self.claims.get("held") is True
 
 
-class ReceiptKey(Value):
-    """The key that receipts are verified with; ``public_key`` is base64 of 32 bytes."""
-
-    algorithm: str
-    key_id: str
-    public_key: str
-
-
 class Contract(_Verbatim):
     """The contract in force. ``raw`` is the answer as it came, which ``veilface lift`` takes."""
 
-    contract_id: Hex
+    contract_id: str
     binding: dict[str, Any]
     calibrations: tuple[dict[str, Any], ...]
     default_level: str
     photos: bool
     generator: bool
     template_enrollment: bool = True  # a service that does not say takes them
-    receipt_key: ReceiptKey
+    receipt_key: dict[str, str]
 
 
 class Generator(Value):
@@ -209,6 +238,14 @@ class Generator(Value):
 
     data: bytes = Field(repr=False)
     source_id: str
+
+    @classmethod
+    def read(cls, response: httpx.Response) -> Self:
+        """Read the generator and the header that names it."""
+        source_id = response.headers.get("X-Decoy-Source-ID")
+        if source_id is None:
+            raise UnexpectedAnswer("the answer has no header X-Decoy-Source-ID")
+        return cls(data=response.content, source_id=source_id)
 
 
 class Export(Answer):
@@ -233,26 +270,3 @@ class Health(Answer):
     """The service can answer."""
 
     status: str
-
-
-A = TypeVar("A", bound=Answer)
-
-
-def parse(model: type[A], response: httpx.Response) -> A:
-    """Read an answer.
-
-    Raises
-    ------
-    UnexpectedAnswer
-        It lacks a field, or has another type. The text names fields, and no value.
-    """
-    try:
-        value = model.model_validate_json(response.content)
-    except ValidationError as error:
-        fields = sorted({".".join(map(str, each["loc"])) or "body" for each in error.errors()})
-        raise UnexpectedAnswer(
-            f"the answer does not fit {model.__name__}: {', '.join(fields)}"
-        ) from None
-    if isinstance(value, _Verbatim):
-        return value.model_copy(update={"raw": response.content})
-    return value

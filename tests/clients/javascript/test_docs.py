@@ -8,12 +8,13 @@ from pathlib import Path
 
 import pytest
 
+from api.http.errors import ERROR_CODES
 from tests.api.deployment import photo, picture
 from tests.clients.conftest import Running
 from tests.clients.javascript.conftest import PACKAGE, Node
 from tests.clients.test_docs import EXAMPLE, ROOT, blocks
 from veilface_client import Client
-from veilface_client.errors import FAMILIES
+from veilface_client.errors import error_class
 
 BLOCKS = blocks("docs/javascript.md", "js")
 FOR_PAGES = [block for block in BLOCKS if "document." in block]
@@ -60,7 +61,9 @@ def test_every_code_of_the_service_has_its_class() -> None:
     source = (PACKAGE / "src" / "service" / "errors.ts").read_text()
     table = source[source.index("FAMILIES") : source.index("BY_STATUS")]
     ours = dict(re.findall(r"^  (\w+): (\w+),$", table, re.M))
-    assert ours == {code: family.__name__ for code, family in FAMILIES.items()}
+    assert ours == {
+        code: error_class(code, error.status).__name__ for code, error in ERROR_CODES.items()
+    }
 
 
 def test_versions_of_both_clients_are_one() -> None:
