@@ -116,7 +116,7 @@ async def caller(
     )
     request.state.log.update(tenant=known.tenant, key_id=known.prefix)
     rate_limits: RateLimits = request.app.state.rate_limits
-    await rate_limits.count_key(known.name)
+    await rate_limits.count_key(known.prefix)
     if subject_token is not None:
         await _require_token(request, runtime, gate, known, subject_token)
     return known

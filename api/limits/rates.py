@@ -1,20 +1,18 @@
 """Rate limits: how many requests an API key and a client address may make in a time.
 
-They are counted with the library `limits`, by its sliding window: the count of the running window
-plus the part of the last one that still counts. In the process by default; in Redis where several
-workers or hosts share the limits. While Redis fails, each worker counts for itself, so that
-neither does an outage of Redis stop the service, nor does it open it.
+The library `limits` counts them by its sliding window: in this process, or in Redis where several
+workers or hosts share the limits. While Redis fails, each worker counts for itself, so that an
+outage of Redis neither stops the service nor opens it.
 
-The limits keep one client from taking the service for himself. What ends guessing is the lockout
-of a subject, which is kept in the database.
+The limits keep one client from taking the service for itself. What ends guessing is the lockout of
+a subject, which is kept in the database.
 """
 
 import ipaddress
 import logging
 import math
 import time
-from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 import anyio
 import limits
@@ -27,169 +25,13 @@ from api.service.logging import log
 from api.service.metrics import RATE_LIMITED, RATE_STORAGE_FAILURES
 from api.settings import OFF, Settings
 
-KEY_PREFIX = "veilface"
 STORAGE_TIMEOUT_S = 0.5
-"""Longest that one step of a question to Redis may take, and so delay a request."""
+"""Longest that a question to Redis may take, and so delay a request."""
 
 RETRY_STORAGE_S = 5.0
 """Time between two attempts to reach a Redis that failed."""
 
 CONNECTIONS = 16
-MAX_COUNTERS = 100_000
-"""Counters that a process keeps for single clients, 21 MB; further clients share ``SHARES``."""
-
-SHARES = 4096
-SWEEP_S = 1.0
-
-
-class ProcessCounters(MemoryStorage):
-    """The library's counters in this process, swept once in a while and bounded.
-
-    The library's own sweep looks at every counter at every request. And an attacker with many
-    addresses makes as many counters as he likes.
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._next_sweep = 0.0
-
-    async def incr(self, key: str, expiry: float, amount: int = 1) -> int:
-        """Count, in the counter of this key or, where there are too many, in one that is shared."""
-        now = time.time()
-        if now >= self._next_sweep:
-            self._next_sweep = now + SWEEP_S
-            for old in [key for key, end in self.expirations.items() if end <= now]:
-                await self.clear(old)
-        if self.expirations.get(key, 0) <= now:
-            await self.clear(key)
-            self.expirations[key] = now + expiry
-        self.storage[key] += amount
-        return self.storage[key]
-
-    async def decr(self, key: str, amount: int = 1) -> int:
-        """Take back a count."""
-        self.storage[key] = max(self.storage[key] - amount, 0)
-        return self.storage[key]
-
-    @property
-    def full(self) -> bool:
-        """Whether no client may get a counter of his own any more."""
-        return len(self.expirations) >= MAX_COUNTERS
-
-
-class Storage(Protocol):
-    """Where requests are counted: in this process, or in Redis with this process to fall back on.
-
-    ``hit`` counts one request and returns None, or the seconds until the next one may pass.
-    """
-
-    async def hit(self, limit: limits.RateLimitItem, kind: str, identity: str) -> float | None:
-        """Count one request of this identity."""
-
-    async def close(self) -> None:
-        """Let go of connections."""
-
-
-class InProcess:
-    """Counts in this process alone."""
-
-    def __init__(self) -> None:
-        self._counters = ProcessCounters()
-        self._limiter = SlidingWindowCounterRateLimiter(self._counters)
-
-    async def hit(self, limit: limits.RateLimitItem, kind: str, identity: str) -> float | None:
-        """Count one request of this identity."""
-        if self._counters.full:
-            # Python's hash of a text is keyed with a secret of the process.
-            identity = f"share-{hash(identity) % SHARES}"
-        return await _hit(self._limiter, limit, kind, identity)
-
-    async def close(self) -> None:
-        """Nothing is open."""
-
-
-class InRedis:
-    """Counts in Redis, and in this process while Redis fails.
-
-    Parameters
-    ----------
-    url
-        Of the Redis server. It may hold a password: no message repeats it.
-    prefix
-        What the names of all keys begin with.
-
-    Raises
-    ------
-    StartError
-        If the client library is absent, or the URL is none. A server that does not answer is an
-        outage like a later one.
-    """
-
-    def __init__(
-        self, url: str, *, prefix: str = KEY_PREFIX, clock: Callable[[], float] = time.monotonic
-    ) -> None:
-        try:
-            from redis.asyncio import BlockingConnectionPool
-            from redis.asyncio.retry import Retry
-            from redis.backoff import NoBackoff
-            from redis.exceptions import RedisError
-        except ImportError:
-            raise StartError(
-                "rate_limit_storage names Redis, but its client is absent: install veilface[redis]"
-            ) from None
-        try:
-            # A connection that Redis closed while it was idle is opened again: hence one retry.
-            self._pool: Any = BlockingConnectionPool.from_url(
-                url,
-                max_connections=CONNECTIONS,
-                timeout=STORAGE_TIMEOUT_S,
-                socket_timeout=STORAGE_TIMEOUT_S,
-                socket_connect_timeout=STORAGE_TIMEOUT_S,
-                retry=Retry(NoBackoff(), 1),
-            )
-            pool: Any = self._pool
-            storage = RedisStorage(
-                "redis://", implementation="redispy", key_prefix=prefix, connection_pool=pool
-            )
-        except (ValueError, limits.errors.ConfigurationError):
-            raise StartError(
-                "setting rate_limit_storage: this is not the URL of a Redis server"
-            ) from None
-        self._limiter = SlidingWindowCounterRateLimiter(storage)
-        # OSError and TimeoutError too: not all of them are wrapped by the client library.
-        self._failures = (RedisError, OSError)
-        self._instead = InProcess()
-        self._clock = clock
-        self._failed = False
-        self._try_again_at = -math.inf
-
-    async def hit(self, limit: limits.RateLimitItem, kind: str, identity: str) -> float | None:
-        """Count one request of this identity."""
-        now = self._clock()
-        if self._failed and now < self._try_again_at:
-            return await self._instead.hit(limit, kind, identity)
-        # One request tries; those that come meanwhile do not wait for it.
-        self._try_again_at = now + RETRY_STORAGE_S
-        try:
-            wait = await _hit(self._limiter, limit, kind, identity)
-        except self._failures as error:
-            if not self._failed:
-                self._failed = True
-                RATE_STORAGE_FAILURES.inc()
-                log(
-                    "rate limit storage failed",
-                    severity=logging.WARNING,
-                    error_type=type(error).__name__,
-                )
-            return await self._instead.hit(limit, kind, identity)
-        if self._failed:
-            self._failed = False
-            log("rate limit storage answers again")
-        return wait
-
-    async def close(self) -> None:
-        """Close the connections."""
-        await self._pool.disconnect()
 
 
 class RateLimits:
@@ -198,35 +40,43 @@ class RateLimits:
     Parameters
     ----------
     key, address
-        Most requests of one API key and of one client address; None for no limit.
-    storage
-        Where they are counted.
+        Most requests of one API key and of one client address, as ``600/minute``, or ``off``.
+    redis_url
+        Where workers count together; None to count in this process. It may hold a password, which
+        no message repeats. A server that does not answer is an outage like a later one.
+    prefix
+        What the names of all keys in Redis begin with.
+
+    Raises
+    ------
+    StartError
+        If the client library of Redis is absent, or the URL is not one of a Redis server.
     """
 
     def __init__(
-        self,
-        *,
-        key: limits.RateLimitItem | None,
-        address: limits.RateLimitItem | None,
-        storage: Storage,
+        self, *, key: str, address: str, redis_url: str | None = None, prefix: str = "veilface"
     ) -> None:
-        self._limits = {"key": key, "address": address}
-        self._storage = storage
+        self._limits = {
+            kind: limits.parse(text)
+            for kind, text in (("key", key), ("address", address))
+            if text != OFF
+        }
+        self._own = SlidingWindowCounterRateLimiter(MemoryStorage())
+        self._redis = None if redis_url is None else _opened(redis_url, prefix)
+        self._shared = self._own
+        if self._redis is not None:
+            self._shared = SlidingWindowCounterRateLimiter(self._redis)
+        self._failed = False
+        self._try_again_at = -math.inf
 
     @classmethod
     def open(cls, settings: Settings) -> "RateLimits":
-        """Make them from the settings.
-
-        Raises
-        ------
-        StartError
-            If the storage cannot be used.
-        """
+        """Make them from the settings; raises as the class does."""
         url = settings.rate_limit_storage
         return cls(
-            key=_parsed(settings.rate_limit_key),
-            address=_parsed(settings.rate_limit_address),
-            storage=InProcess() if url == "memory://" else InRedis(url),
+            key=settings.rate_limit_key,
+            address=settings.rate_limit_address,
+            redis_url=None if url == "memory://" else url,
         )
 
     async def count_address(self, scope: Scope) -> None:
@@ -241,24 +91,20 @@ class RateLimits:
         await self._count("address", address_of(client[0] if client else ""))
 
     async def count_key(self, prefix: str) -> None:
-        """Count a request by the API key that was recognised, named by its prefix.
-
-        Raises
-        ------
-        ApiError
-            ``rate_limited``, with ``Retry-After``.
-        """
+        """Count a request by its API key, or the one that made its token; raises as above."""
         await self._count("key", prefix)
 
     async def close(self) -> None:
-        """Let go of the storage."""
-        await self._storage.close()
+        """Close the connections to Redis."""
+        if self._redis is not None:
+            bridge: Any = self._redis.bridge
+            await bridge.storage.connection_pool.disconnect()
 
     async def _count(self, kind: str, identity: str) -> None:
-        limit = self._limits[kind]
+        limit = self._limits.get(kind)
         if limit is None:
             return
-        wait = await self._storage.hit(limit, kind, identity)
+        wait = await self._wait(limit, kind, identity)
         if wait is not None:
             RATE_LIMITED.labels(kind).inc()
             who = "with this API key" if kind == "key" else "from this address"
@@ -268,6 +114,64 @@ class RateLimits:
                 {"limit": kind},
                 {"Retry-After": str(max(1, math.ceil(wait)))},
             )
+
+    async def _wait(self, limit: limits.RateLimitItem, *identity: str) -> float | None:
+        """Count one request; return the seconds until the next may pass, None where it passes."""
+        now = time.monotonic()
+        if self._failed and now < self._try_again_at:
+            return await _hit(self._own, limit, *identity)
+        # One request tries a Redis that failed; those that come meanwhile do not wait for it.
+        self._try_again_at = now + RETRY_STORAGE_S
+        try:
+            with anyio.fail_after(STORAGE_TIMEOUT_S):
+                wait = await _hit(self._shared, limit, *identity)
+        except (limits.errors.StorageError, OSError) as error:
+            if not self._failed:
+                RATE_STORAGE_FAILURES.inc()
+                kind = type(error).__name__
+                log("rate limit storage failed", severity=logging.WARNING, error_type=kind)
+            self._failed = True
+            return await _hit(self._own, limit, *identity)
+        if self._failed:
+            log("rate limit storage answers again")
+        self._failed = False
+        return wait
+
+
+def _opened(url: str, prefix: str) -> RedisStorage:
+    try:
+        from redis.asyncio import BlockingConnectionPool
+        from redis.asyncio.retry import Retry
+        from redis.backoff import NoBackoff
+    except ImportError:
+        raise StartError(
+            "rate_limit_storage names Redis, but its client is absent: install veilface[redis]"
+        ) from None
+    try:
+        # A connection that Redis closed while it was idle is opened again: hence one retry.
+        pool: Any = BlockingConnectionPool.from_url(
+            url, max_connections=CONNECTIONS, retry=Retry(NoBackoff(), 1)
+        )
+        return RedisStorage(
+            "redis://",
+            wrap_exceptions=True,
+            implementation="redispy",
+            key_prefix=prefix,
+            connection_pool=pool,
+        )
+    except (ValueError, limits.errors.ConfigurationError):
+        raise StartError(
+            "setting rate_limit_storage: this is not the URL of a Redis server"
+        ) from None
+
+
+async def _hit(
+    limiter: SlidingWindowCounterRateLimiter, limit: limits.RateLimitItem, *identity: str
+) -> float | None:
+    if await limiter.hit(limit, *identity):
+        return None
+    window = await limiter.get_window_stats(limit, *identity)
+    return window.reset_time - time.time()
 
 
 def address_of(host: str) -> str:
@@ -285,20 +189,3 @@ def address_of(host: str) -> str:
             return str(address.ipv4_mapped)
         return str(ipaddress.IPv6Network((int(address) >> 64 << 64, 64)))
     return str(address)
-
-
-def _parsed(text: str) -> limits.RateLimitItem | None:
-    return None if text == OFF else limits.parse(text)
-
-
-async def _hit(
-    limiter: SlidingWindowCounterRateLimiter, limit: limits.RateLimitItem, kind: str, identity: str
-) -> float | None:
-    if await limiter.hit(limit, kind, identity):
-        return None
-    window = await limiter.get_window_stats(limit, kind, identity)
-    if not window.remaining and window.reset_time <= time.time():
-        # In the very first millisecond of a window, limits takes its end for its beginning.
-        await anyio.sleep(0.002)
-        window = await limiter.get_window_stats(limit, kind, identity)
-    return window.reset_time - time.time()

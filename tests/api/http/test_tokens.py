@@ -541,18 +541,6 @@ def test_the_audit_log_and_the_metrics_tell_of_tokens(service: Service) -> None:
         store.close()
 
 
-def test_tokens_have_a_rate_of_their_own(tmp_path: Path) -> None:
-    deployment = deploy(tmp_path, rate_limit_key="3/hour", lockout_after=0)
-    with Client(create_app(deployment.settings)) as client:
-        first, second = (issue(client, headers=bearer(deployment.token))["token"] for _ in range(2))
-        for _ in range(3):
-            assert client.get("/v1/contract", headers=bearer(first)).status_code == 200
-        assert_error(client.get("/v1/contract", headers=bearer(first)), 429, "rate_limited")
-        # Neither another visitor nor the server that asks for tokens is held up.
-        assert client.get("/v1/contract", headers=bearer(second)).status_code == 200
-        issue(client, headers=bearer(deployment.token))
-
-
 def test_a_page_of_an_allowed_origin_uses_a_token(tmp_path: Path) -> None:
     origin = "https://shop.example"
     deployment = deploy(tmp_path, cors_origins=origin, lockout_after=0)

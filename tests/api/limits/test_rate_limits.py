@@ -8,12 +8,11 @@ import signal
 import time
 from collections import Counter
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
-from contextlib import asynccontextmanager
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from typing import Any
 
 import anyio
 import httpx
-import limits
 import pytest
 import redis
 import uvicorn
@@ -21,8 +20,8 @@ from fastapi import FastAPI
 
 from api.http.app import create_app, uvicorn_options
 from api.http.errors import ApiError, StartError
-from api.limits import rates as rate_limits
-from api.limits.rates import InProcess, InRedis, RateLimits, Storage, address_of
+from api.limits import rates
+from api.limits.rates import RateLimits, address_of
 from api.service.metrics import RATE_LIMITED, RATE_STORAGE_FAILURES
 from api.settings import Settings, load_settings
 from tests.api.deployment import Deployment, bearer, deploy
@@ -30,11 +29,11 @@ from tests.api.shapes import assert_error
 from tests.redis_server import OwnRedis, own_redis_server
 
 REDIS = os.environ.get("VEILFACE_TEST_REDIS_URL", "redis://127.0.0.1:6379/0")
-Make = Callable[[], Storage]
+Make = Callable[[str], AbstractAsyncContextManager[RateLimits]]
 
 
 @pytest.fixture(scope="session")
-def redis_server() -> str:
+def redis_url() -> str:
     client = redis.Redis.from_url(REDIS, socket_connect_timeout=3)
     try:
         client.ping()
@@ -46,29 +45,29 @@ def redis_server() -> str:
 
 
 @pytest.fixture
-def prefix(redis_server: str) -> Iterator[str]:
+def prefix(redis_url: str) -> Iterator[str]:
     """A prefix of this test's own; its keys go at the end."""
     name = f"veilface-test-{secrets.token_hex(6)}"
     yield name
-    with redis.Redis.from_url(redis_server) as client:
+    with redis.Redis.from_url(redis_url) as client:
         for key in client.scan_iter(f"{name}:*"):
             client.delete(key)
 
 
 @pytest.fixture(params=["process", "redis"])
 def make(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Make:
-    """Makes a storage; two in Redis share their counts."""
-    if request.param == "process":
-        return InProcess
-    url, prefix = request.getfixturevalue("redis_server"), request.getfixturevalue("prefix")
-    # On a busy machine Redis may answer late, and would be taken for one that is away.
-    monkeypatch.setattr(rate_limits, "STORAGE_TIMEOUT_S", 30.0)
-    return lambda: InRedis(url, prefix=prefix)
+    """Makes limits by key; two in Redis share their counts."""
+    where = {}
+    if request.param == "redis":
+        where = {name: request.getfixturevalue(name) for name in ("redis_url", "prefix")}
+        # On a busy machine Redis may answer late, and would be taken for one that is away.
+        monkeypatch.setattr(rates, "STORAGE_TIMEOUT_S", 30.0)
+    return lambda key: opened(key=key, **where)
 
 
 @asynccontextmanager
-async def limited(storage: Storage, *, key: str | None = None) -> AsyncIterator[RateLimits]:
-    made = RateLimits(key=None if key is None else limits.parse(key), address=None, storage=storage)
+async def opened(**options: Any) -> AsyncIterator[RateLimits]:
+    made = RateLimits(**{"address": "off", **options})
     try:
         yield made
     finally:
@@ -103,12 +102,12 @@ def test_an_address_is_counted_by_what_one_client_has(host: str, counted: str) -
 
 def test_the_next_one_is_refused_and_told_how_long_to_wait(make: Make) -> None:
     async def scenario() -> None:
-        async with limited(make(), key="3/2 second") as rates:
+        async with make("3/2 second") as counted:
             for a in itertools.count():
                 begun, before = time.monotonic(), RATE_LIMITED.labels("key")._value.get()
                 for _ in range(3):
-                    await rates.count_key(f"a{a}")
-                refused = await refusal(rates.count_key(f"a{a}"))
+                    await counted.count_key(f"a{a}")
+                refused = await refusal(counted.count_key(f"a{a}"))
                 if time.monotonic() < begun + 1:
                     break  # else this machine may have taken so long that three more may pass
             assert refused is not None
@@ -116,34 +115,10 @@ def test_the_next_one_is_refused_and_told_how_long_to_wait(make: Make) -> None:
             wait = refused.headers["Retry-After"]
             assert wait.isdecimal()
             assert 1 <= int(wait) <= 4
-            assert await refusal(rates.count_key("b")) is None
+            assert await refusal(counted.count_key("b")) is None
             assert RATE_LIMITED.labels("key")._value.get() == before + 1
             await anyio.sleep(int(wait) + 0.1)
-            assert await refusal(rates.count_key(f"a{a}")) is None
-
-    anyio.run(scenario)
-
-
-def test_the_wait_is_right_in_the_first_millisecond_of_a_window() -> None:
-    """All at once, Redis' clock standing still: it counts whole milliseconds."""
-
-    class Standing(InProcess):
-        def __init__(self) -> None:
-            super().__init__()
-            self._counters.get_sliding_window = self._window  # type: ignore[method-assign]
-            self.asked = 0
-
-        async def _window(self, key: str, expiry: int) -> tuple[int, float, int, float]:
-            self.asked += 1
-            return 0, 0.0, 3, 2.0 * expiry - (0.0 if self.asked == 1 else 0.002)
-
-    async def scenario() -> None:
-        async with limited(Standing(), key="3/100 second") as rates:
-            for _ in range(3):
-                await rates.count_key("a")
-            refused = await refusal(rates.count_key("a"))
-            assert refused is not None
-            assert refused.headers["Retry-After"] == "100"
+            assert await refusal(counted.count_key(f"a{a}")) is None
 
     anyio.run(scenario)
 
@@ -151,73 +126,36 @@ def test_the_wait_is_right_in_the_first_millisecond_of_a_window() -> None:
 def test_exactly_as_many_pass_as_may_however_many_come_at_once(make: Make) -> None:
     outcomes: Counter[str] = Counter()
 
-    async def count(rates: RateLimits) -> None:
-        refused = await refusal(rates.count_key("a"))
+    async def count(counted: RateLimits) -> None:
+        refused = await refusal(counted.count_key("a"))
         outcomes["passed" if refused is None else refused.code] += 1
 
     async def scenario() -> None:
-        async with limited(make(), key="50/day") as rates, anyio.create_task_group() as tasks:
+        async with make("50/day") as counted, anyio.create_task_group() as tasks:
             for _ in range(200):
-                tasks.start_soon(count, rates)
+                tasks.start_soon(count, counted)
 
     anyio.run(scenario)
     assert outcomes == {"passed": 50, "rate_limited": 150}
 
 
-def test_workers_share_a_limit_in_redis_and_not_without_it(make: Make) -> None:
+def test_workers_share_a_limit_in_redis_and_not_without_it(
+    make: Make, request: pytest.FixtureRequest
+) -> None:
     async def scenario() -> list[bool]:
-        async with limited(make(), key="4/day") as one, limited(make(), key="4/day") as other:
+        async with make("4/day") as one, make("4/day") as other:
             return [await refusal(each.count_key("a")) is None for each in (one, other) * 4]
 
     passed = anyio.run(scenario)
-    assert sum(passed) == (8 if make is InProcess else 4)
+    assert sum(passed) == (4 if "redis" in request.node.callspec.id else 8)
 
 
-def test_no_limit_asks_nothing() -> None:
-    class Never(InProcess):
-        async def hit(self, *_: Any) -> float | None:
-            raise AssertionError
-
+def test_off_is_no_limit() -> None:
     async def scenario() -> None:
-        async with limited(Never()) as rates:
-            await rates.count_key("a")
-            await rates.count_address({"client": ("192.0.2.1", 1)})
-
-    anyio.run(scenario)
-
-
-def test_many_addresses_do_not_fill_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("api.limits.rates.MAX_COUNTERS", 100)
-    monkeypatch.setattr("api.limits.rates.SHARES", 8)
-    storage, limit = InProcess(), limits.parse("5/day")
-
-    async def scenario() -> None:
-        for number in range(100):
-            assert await storage.hit(limit, "address", f"early-{number}") is None
-        passed = [
-            await storage.hit(limit, "address", f"late-{number}") is None for number in range(1000)
-        ]
-        # Late ones share the few counters that are left, so the flood is limited as a whole.
-        assert sum(passed) == 5 * 8
-        assert len(storage._counters.expirations) == 108
-        assert len(storage._counters.storage) <= 108
-
-    anyio.run(scenario)
-
-
-def test_old_counters_go(monkeypatch: pytest.MonkeyPatch) -> None:
-    storage, limit, now = InProcess(), limits.parse("5/second"), 1e9
-    monkeypatch.setattr(time, "time", lambda: now)
-
-    async def scenario() -> None:
-        nonlocal now
-        for number in range(50):
-            await storage.hit(limit, "address", str(number))
-        assert len(storage._counters.expirations) >= 50
-        now += 2.1
-        await storage.hit(limit, "address", "new")
-        assert len(storage._counters.expirations) == 1
-        assert len(storage._counters.storage) == 1
+        async with opened(key="off") as counted:
+            for _ in range(100):
+                await counted.count_key("a")
+                await counted.count_address({"client": ("192.0.2.1", 1)})
 
     anyio.run(scenario)
 
@@ -235,28 +173,28 @@ def events(text: str) -> list[str]:
 def test_while_redis_is_away_each_worker_counts_for_itself(
     own_redis: OwnRedis, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("api.limits.rates.RETRY_STORAGE_S", 0.3)
+    monkeypatch.setattr(rates, "RETRY_STORAGE_S", 0.3)
     # One that is away refuses at once; one that answers late on a busy machine is not away.
-    monkeypatch.setattr("api.limits.rates.STORAGE_TIMEOUT_S", 30.0)
+    monkeypatch.setattr(rates, "STORAGE_TIMEOUT_S", 30.0)
 
-    async def passed(rates: RateLimits, times: int) -> int:
-        return sum([await refusal(rates.count_key("a")) is None for _ in range(times)])
+    async def passed(counted: RateLimits, times: int) -> int:
+        return sum([await refusal(counted.count_key("a")) is None for _ in range(times)])
 
     async def scenario() -> None:
         from api.service.logging import configure
 
         configure("info")
         failures = RATE_STORAGE_FAILURES._value.get()
-        async with limited(InRedis(own_redis.url), key="10/day") as rates:
-            assert await passed(rates, 4) == 4
+        async with opened(redis_url=own_redis.url, key="10/day") as counted:
+            assert await passed(counted, 4) == 4
             own_redis.kill()
-            assert await passed(rates, 15) == 10
+            assert await passed(counted, 15) == 10
             await anyio.sleep(0.4)
-            assert await passed(rates, 3) == 0  # it is tried again, in vain, and the limit holds
+            assert await passed(counted, 3) == 0  # it is tried again, in vain, and the limit holds
             assert RATE_STORAGE_FAILURES._value.get() == failures + 1
             own_redis.start()
             await anyio.sleep(0.4)
-            assert await passed(rates, 15) == 10  # a fresh server has counted nothing
+            assert await passed(counted, 15) == 10  # a fresh server has counted nothing
         assert events(capfd.readouterr().err) == [
             "rate limit storage failed",
             "rate limit storage answers again",
@@ -270,13 +208,13 @@ def test_a_redis_that_hangs_does_not_hold_a_request(
     own_redis: OwnRedis, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async def scenario() -> None:
-        async with limited(InRedis(own_redis.url), key="10/day") as rates:
-            await rates.count_key("a")
+        async with opened(redis_url=own_redis.url, key="10/day") as counted:
+            await counted.count_key("a")
             assert own_redis.process is not None
             own_redis.process.send_signal(signal.SIGSTOP)
             try:
                 for _ in range(5):  # returns although Redis never answers
-                    await rates.count_key("a")
+                    await counted.count_key("a")
             finally:
                 own_redis.process.send_signal(signal.SIGCONT)
 
@@ -311,10 +249,15 @@ async def served(settings: Settings) -> AsyncIterator[FastAPI]:
         yield app
 
 
-async def sent(app: Any, path: str, *, host: str = "192.0.2.1", **headers: str) -> httpx.Response:
+async def sent(
+    app: Any, path: str, *, host: str = "192.0.2.1", json: Any = None, **headers: str
+) -> httpx.Response:
+    """GET a path, or POST JSON to it."""
     transport = httpx.ASGITransport(app, client=(host, 1234))
     async with httpx.AsyncClient(transport=transport, base_url="http://test") as client:
-        return await client.get(path, headers=headers)
+        return await client.request(
+            "GET" if json is None else "POST", path, json=json, headers=headers
+        )
 
 
 @pytest.fixture(scope="module")
@@ -365,6 +308,26 @@ def test_a_key_is_counted_wherever_it_is_used_from(tight: Deployment) -> None:
             assert [each.status_code for each in answers] == [200] * 4 + [429] * 2
             assert assert_error(answers[-1], 429, "rate_limited") == {"limit": "key"}
             assert (await sent(app, "/v1/contract", **bearer(other))).status_code == 200
+
+    anyio.run(scenario)
+
+
+def test_tokens_count_for_the_key_that_made_them(tight: Deployment) -> None:
+    key = bearer(tight.key("verify"))
+
+    async def scenario() -> None:
+        async with served(tight.settings) as app:
+            tokens = []
+            for number in range(2):
+                body = {"subject_id": f"s{number}", "action": "verify"}
+                answer = await sent(app, "/v1/tokens", host=f"192.0.2.{number}", json=body, **key)
+                tokens.append(answer.json()["token"])
+            answers = [
+                await sent(app, "/v1/contract", host=f"198.51.100.{number}", **bearer(token))
+                for number, token in enumerate(tokens * 2)
+            ]
+            assert [each.status_code for each in answers] == [200] * 2 + [429] * 2
+            assert (await sent(app, "/v1/contract", **key)).status_code == 429
 
     anyio.run(scenario)
 
