@@ -26,9 +26,8 @@ from api.http.context import RequestContext
 from api.http.cors import Cors
 from api.http.deps import refuse_unknown
 from api.http.errors import ApiError, StartError, api_error, wrong_values
-from api.http.openapi import allowed_methods
+from api.http.openapi import DescribedApi, allowed_methods, describe, operation_id
 from api.http.protocol import Protocol
-from api.http.reference import DescribedApi, describe, operation_id
 from api.http.routes import (
     audit_log,
     challenges,
@@ -128,7 +127,7 @@ def create_app(
     else:
         _add_middleware(app, settings, operations_paths=frozenset())
     if settings.api_docs:
-        app.router.routes.extend(reference_routes(app))
+        app.router.routes.extend(reference_routes())
     return app
 
 

@@ -1,8 +1,13 @@
 """What OpenAPI says of errors and request bodies, derived from the one table of codes."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
+
+from fastapi import FastAPI
+from fastapi.openapi.utils import get_openapi
+from fastapi.routing import APIRoute
+from starlette.routing import BaseRoute
 
 from api.http.errors import ERROR_CODES
 from api.http.schemas import (
@@ -20,6 +25,14 @@ DESCRIPTION = """\
 Face authentication that never stores a face embedding. Every error has one shape; the codes are
 listed with every call. `X-Request-ID` is accepted, and returned in the header and in the body.
 """
+
+TAGS = (
+    {"name": "Enroll and verify"},
+    {"name": "People", "description": "Who is enrolled; erase, export and import them."},
+    {"name": "Tokens", "description": "What a browser holds in place of an API key."},
+    {"name": "Operations", "description": "Contract, keys, audit log, health and metrics."},
+)
+"""Groups of calls, in the order of the reference."""
 
 EVERY_CALL = (
     "unauthorized",
@@ -41,6 +54,31 @@ PHOTO = (
 )
 
 CHECKED_PHOTO = ("unsupported_image", "image_too_large", "too_many_images", "model_unavailable")
+
+
+class DescribedApi(FastAPI):
+    """An application whose OpenAPI document is there before a request asks for it."""
+
+    def __init__(self, document: dict[str, Any], **options: Any) -> None:
+        super().__init__(**options)
+        self._document = document
+
+    def openapi(self) -> dict[str, Any]:
+        """Return the OpenAPI document."""
+        return self._document
+
+
+def operation_id(route: APIRoute) -> str:
+    """Name an operation after its function: ``erase_subject`` is ``eraseSubject``."""
+    first, *rest = route.name.split("_")
+    return first + "".join(word.capitalize() for word in rest)
+
+
+def describe(routes: Sequence[BaseRoute], *, version: str) -> dict[str, Any]:
+    """Make the OpenAPI document of routes."""
+    return get_openapi(
+        title="Veilface", version=version, description=DESCRIPTION, tags=[*TAGS], routes=routes
+    )
 
 
 def error_responses(*codes: str) -> dict[int | str, dict[str, Any]]:

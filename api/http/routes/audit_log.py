@@ -15,7 +15,7 @@ from templates.store.audit_log import Line
 from templates.store.cursors import close_cursor, open_cursor
 from templates.store.identifiers import checked_subject_id
 
-router = APIRouter(prefix="/v1/audit-log", tags=["audit log"])
+router = APIRouter(prefix="/v1/audit-log", tags=["Operations"])
 
 _CURSOR_PURPOSE = "audit-log-cursor"
 

@@ -13,7 +13,7 @@ from api.http.values import iso_time
 from templates.store.identifiers import checked_subject_id
 from verify import MAX_FRAMES, MIN_FRAMES
 
-router = APIRouter(prefix="/v1/challenges", tags=["subjects"])
+router = APIRouter(prefix="/v1/challenges", tags=["Enroll and verify"])
 
 
 @router.post(

@@ -12,7 +12,7 @@ from api.http.receipts import receipt_key_json
 from api.http.schemas import ContractAnswer
 from templates.decoys import DecoyGenerator
 
-router = APIRouter(prefix="/v1/contract", tags=["contract"])
+router = APIRouter(prefix="/v1/contract", tags=["Operations"])
 
 
 @router.get(

@@ -38,7 +38,7 @@ from templates.store.audit_log import By
 from templates.store.subject_rows import Source
 from templates.store.subjects import Precondition
 
-router = APIRouter(prefix="/v1/subjects", tags=["subjects"])
+router = APIRouter(prefix="/v1/subjects", tags=["Enroll and verify"])
 
 CODES = (
     *EVERY_CALL,

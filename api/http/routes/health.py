@@ -12,7 +12,7 @@ from api.http.schemas import HealthAnswer
 from api.service.metrics import exposition
 from api.service.operations import Readiness
 
-router = APIRouter(tags=["health"])
+router = APIRouter(tags=["Operations"])
 
 
 @router.head("/health/live", include_in_schema=False)

@@ -11,7 +11,7 @@ from api.http.openapi import EVERY_CALL, error_responses
 from api.http.schemas import LockoutAnswer, UnlockAnswer
 from api.http.values import iso_time
 
-router = APIRouter(prefix="/v1/subjects", tags=["subjects"])
+router = APIRouter(prefix="/v1/subjects", tags=["People"])
 
 
 @router.get(

@@ -11,7 +11,7 @@ from api.http.schemas import KeyAnswer
 from api.http.values import iso_time
 from templates.store.api_keys import Right
 
-router = APIRouter(prefix="/v1/key", tags=["keys"])
+router = APIRouter(prefix="/v1/key", tags=["Operations"])
 
 
 @router.get(

@@ -19,7 +19,7 @@ from api.http.schemas import PackAnswer
 from api.limits.admission import Downloads
 from api.service.served_graphs import licence_of
 
-router = APIRouter(prefix="/v1/pack", tags=["contract"])
+router = APIRouter(prefix="/v1/pack", tags=["Tokens"])
 
 KEPT = "private, max-age=31536000, immutable"
 FIRST_S = 30.0

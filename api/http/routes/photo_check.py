@@ -15,7 +15,7 @@ from api.http.values import face_policy
 from api.service.metrics import step
 from models.errors import FaceError
 
-router = APIRouter(prefix="/v1/photos", tags=["photos"])
+router = APIRouter(prefix="/v1/photos", tags=["Enroll and verify"])
 
 
 @router.post(

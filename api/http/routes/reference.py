@@ -1,31 +1,49 @@
-"""The API reference at `/docs`: a page and its style sheet, from memory."""
+"""The API reference at `/docs`: Swagger UI, by files that a package brings, from memory.
 
-import functools
-from pathlib import Path
+It reads `/v1/openapi.json` of this service and names no other host. A key that is entered there is
+kept by the page until it is closed.
+"""
 
-from fastapi import FastAPI
+from importlib.resources import files
+
 from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import BaseRoute
 
-from api.http.reference import render
-from api.http.routes.page import Served, route_of
+from api.http.routes.page import HEADERS, Served, route_of
 
-STYLE = Path(__file__).resolve().parents[1] / "reference.css"
+PAGE = """<!doctype html><html lang="en"><head><meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1"><title>Veilface API</title>
+<link rel="stylesheet" href="/docs/swagger-ui.css"></head><body><main id="reference"></main>
+<script src="/docs/swagger-ui-bundle.js"></script><script src="/docs/start.js"></script>
+</body></html>
+"""
+START = """SwaggerUIBundle({
+  url: "/v1/openapi.json", dom_id: "#reference", deepLinking: true, validatorUrl: null,
+});
+"""
+POLICY = {
+    **HEADERS,
+    # Swagger UI writes styles into its elements, and its style sheet has pictures in it.
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; "
+    "style-src 'self' 'unsafe-inline'; img-src 'self' data:; connect-src 'self'; "
+    "frame-ancestors 'none'; base-uri 'none'; form-action 'none'",
+}
 
 
-def reference_routes(app: FastAPI) -> list[BaseRoute]:
-    """Return the routes of the reference of an application."""
-    sheet = Served.of(STYLE.read_bytes(), ".css")
+def reference_routes() -> list[BaseRoute]:
+    """Return the routes of the reference."""
+    brought = files("fastapi_offline") / "static"
+    served = {
+        "/docs": Served.of(PAGE.encode(), ".html"),
+        "/docs/start.js": Served.of(START.encode(), ".js"),
+    }
+    for name in ("swagger-ui-bundle.js", "swagger-ui.css"):
+        served[f"/docs/{name}"] = Served.of(
+            brought.joinpath(name).read_bytes(), name[name.rindex(".") :]
+        )
 
-    @functools.cache
-    def rendered() -> Served:
-        return Served.of(render(app.openapi()).encode(), ".html")
+    async def file(request: Request) -> Response:
+        return served[request.url.path].answer(request, POLICY)
 
-    async def page(request: Request) -> Response:
-        return rendered().answer(request)
-
-    async def style(request: Request) -> Response:
-        return sheet.answer(request)
-
-    return [route_of("/docs", page), route_of("/docs/reference.css", style)]
+    return [route_of(path, file) for path in served]

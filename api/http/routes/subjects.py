@@ -24,7 +24,7 @@ from api.http.values import iso_time
 from templates.contract.document import Binding
 from templates.store.subject_rows import SubjectRecord
 
-router = APIRouter(prefix="/v1/subjects", tags=["subjects"])
+router = APIRouter(prefix="/v1/subjects", tags=["People"])
 
 
 @router.get(

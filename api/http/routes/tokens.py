@@ -21,7 +21,7 @@ from templates.store.identifiers import checked_subject_id
 
 FIELDS = ("subject_id", "action", "level", "lifetime_s", "replace")
 
-router = APIRouter(prefix="/v1", tags=["tokens"])
+router = APIRouter(prefix="/v1", tags=["Tokens"])
 
 
 @router.post(

@@ -19,7 +19,7 @@ from api.http.transfer import open_export
 from templates.store.identifiers import checked_subject_id
 from templates.store.subject_rows import Source
 
-router = APIRouter(prefix="/v1/subjects", tags=["transfer"])
+router = APIRouter(prefix="/v1/subjects", tags=["People"])
 
 
 @router.get(

@@ -30,7 +30,7 @@ from templates.store.attempts import Attempt
 from templates.store.audit_log import By
 from verify import Decision
 
-router = APIRouter(prefix="/v1/subjects", tags=["subjects"])
+router = APIRouter(prefix="/v1/subjects", tags=["Enroll and verify"])
 
 CODES = (
     *EVERY_CALL,
