@@ -121,7 +121,7 @@ def distances(
         "brackets)."
     )
     place = f"{facts['processors']} processors" if device is None else device
-    say(f"Measured on {place}. docs/distances.md says how to read it.")
+    say(f"Measured on {place}. docs/contributing.md#distances says how to read it.")
 
 
 @app.command()
