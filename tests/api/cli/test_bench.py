@@ -4,14 +4,11 @@ import os
 import statistics
 import sys
 
-import numpy as np
 import pytest
 
 from api.cli import bench, distance_bench
-from benchmarks import all_pairs
-from templates.distances import DEFAULT_STEPS, Metric, pairwise_distances, similarity
+from templates.distances import DEFAULT_STEPS
 from tests.api.cli.conftest import run
-from tests.templates.distances.batches import faces
 
 TINY = ("bench", "distances", "--count", "9", "--n", "12,24", "--dim", "2,3", "--repeats", "3")
 
@@ -132,29 +129,3 @@ def test_memory_that_runs_out_is_no_defect(monkeypatch: pytest.MonkeyPatch):
     shown = run(*TINY)
     assert shown.status == 1
     assert "error: not enough memory" in shown.stderr
-
-
-# --- the benchmarks that use it ----------------------------------------------------------------
-
-
-def test_thresholds_are_the_first_that_meet_a_target():
-    similarities = np.array([0.3, 0.4, 0.5])
-    lines = all_pairs.table(similarities, np.array([500, 30, 2]), 1000).splitlines()
-    assert lines[2].startswith("| 1e-01 | 0.400 | 30 | 0.03 |")
-    assert lines[3].startswith("| 1e-02 | 0.500 | 2 | 0.002 |")
-    assert lines[4].startswith("| 1e-03 | above 0.500")
-
-
-def test_impostor_pairs_are_counted_both_ways():
-    labels = np.array([0, 0, 1, 2, 2, 2])
-    assert all_pairs.impostor_pairs(labels) == int((labels[:, None] != labels[None]).sum())
-
-
-@pytest.mark.parametrize("metric", Metric)
-def test_thresholds_start_where_15_percent_of_the_strangers_are(metric: Metric):
-    templates = faces(40, 3, seed=1, n=24)
-    people = all_pairs.People(faces(40, 3, seed=2, n=24).feet, np.arange(40) // 2)
-    found = similarity(pairwise_distances(people.descriptors, templates, metric=metric))
-    strangers = found[people.labels[:, None] != people.labels]
-    low = all_pairs.thresholds(people, templates, metric)[0]
-    assert (strangers >= low).mean() == pytest.approx(0.15, abs=0.01)
