@@ -84,6 +84,18 @@ def listed_dims(text: str, option: str, *, n: int, example: str) -> tuple[int, .
     return dims
 
 
+def listed_numbers(
+    text: str, option: str, *, least: int, most: int | None = None
+) -> tuple[int, ...]:
+    """Read whole numbers within bounds, each once."""
+    numbers = listed(text, int, option, expected="whole numbers such as 8,16")
+    for number in numbers:
+        if number < least or (most is not None and number > most):
+            taken = f"from {least}" + ("" if most is None else f" to {most}")
+            raise UsageError(f"{option} takes numbers {taken}, not {number}")
+    return tuple(dict.fromkeys(numbers))
+
+
 def named_file(file: Path | None) -> dict[str, Json] | None:
     """Name and SHA-256 of a file that figures depend on."""
     if file is None:

@@ -1,0 +1,207 @@
+"""``veilface bench distances``: distances beside the matrix product that they cannot do without.
+
+A distance starts from the products of stacked rows (docs/contributing.md "The way of a pair"). All of
+them in one matrix of its own is the *bare product*. The distances and the product are timed in
+turn, so that what else the machine does meets them alike, and compared repeat by repeat. Beside
+them stands the paper's formula as its authors compute it, on fewer pairs.
+"""
+
+import statistics
+import time
+from collections.abc import Callable
+from itertools import product
+from typing import Annotated
+
+import numpy as np
+import typer
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from api.cli.console import progress
+from api.cli.errors import UsageError
+from api.cli.inputs import listed_dims, listed_names, listed_numbers
+from api.cli.options import PROCESSOR, Device, chosen_device
+from api.cli.results import Result, Table, reports
+from api.settings import processors
+from templates.distances import Metric, Probes, on_device, pairwise_distances, warm_up
+from templates.keys.randomness import Keystream
+from templates.space.subspace import SubspaceBatch
+
+Array32 = NDArray[np.float32]
+REST_S = 0.2
+"""Time for the matrix library's threads to go to sleep: after a product they turn on the spot."""
+AUTHORS_COUNT = 100
+"""Probes, and templates, of the authors' formula."""
+COLUMNS = ("n", "m", "mode", "metric", "product, ms", "distances, ms", "× product", "authors")
+
+
+@reports()
+def distances(
+    *,
+    count: Annotated[
+        int, typer.Option(min=1, help="Probes, and templates: COUNT × COUNT distances.")
+    ] = 1000,
+    n: Annotated[str, typer.Option("--n", help="Numbers in an embedding.")] = "128,512",
+    dim: Annotated[str, typer.Option(help="Dimensions m of the subspaces.")] = "2,4,8,16",
+    mode: Annotated[
+        str, typer.Option(help="`p2s` compares points with templates, `s2s` lifted probes.")
+    ] = "p2s,s2s",
+    metric: Annotated[
+        str, typer.Option(help="`euclidean` is the paper's, `spherical` the service's.")
+    ] = "euclidean,spherical",
+    repeats: Annotated[
+        int, typer.Option(min=1, help="Timed repeats; medians of them are shown.")
+    ] = 5,
+    threads: Annotated[
+        int | None,
+        typer.Option(min=1, help="Threads of distances and products. Unset: the library's."),
+    ] = None,
+    device: Device = PROCESSOR,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the embeddings.")] = 0,
+) -> Result:
+    """Time all distances between probes and templates, beside the bare matrix product.
+
+    Needs the extra `evaluate`. It draws embeddings of nobody, spread like faces, and lifts them.
+    Every time is shown as a multiple of the products that a distance starts from, made as one
+    matrix (`× product`), timed in turn in the same run; `authors` is the paper's Euclidean formula
+    as its authors compute it, in multiples of our time. The default options take some minutes; the
+    first run on a machine compiles the loops, which takes half a minute.
+
+    Example: `veilface bench distances --n 512 --dim 16 --metric spherical`
+    """
+    sizes = listed_numbers(n, "--n", least=2)
+    dims = listed_dims(dim, "--dim", n=min(sizes), example="8,16")
+    cells = [
+        (size, m, kind, Metric(name))
+        for size, m in product(sizes, dims)
+        for kind in listed_names(mode, ("p2s", "s2s"), "--mode")
+        for name in listed_names(metric, tuple(Metric), "--metric")
+    ]
+    on = chosen_device(device)
+    if on is not None and threads is not None:
+        raise UsageError("--threads counts the processor's threads: leave it out with --device")
+    if on is None:
+        warm_up()
+    rows = []
+    with (
+        progress("measuring", len(cells)) as advance,
+        threadpool_limits(limits=threads, user_api="blas"),
+        on_device(on),
+    ):
+        for size, m, kind, each in cells:
+            stream = Keystream.seeded("distance bench", seed, size, m)
+            templates = face_like_templates(count, m, size, stream=stream)
+            probes: Probes = face_like(count, size, stream=stream)
+            if kind == "s2s":
+                probes = face_like_templates(count, m, size, stream=stream)
+            times = time_in_turn(probes, templates, each, repeats=repeats, threads=threads)
+            rows.append({"n": size, "m": m, "mode": kind, "metric": str(each), **times})
+            advance(1)
+    shown = [
+        (
+            *(row[name] for name in ("n", "m", "mode", "metric")),
+            f"{row['product_ms']:.1f}",
+            f"{row['distances_ms']:.1f}",
+            f"{row['ratio_to_product']:.2f} ({row['ratio_to_product_low']:.2f}-"
+            f"{row['ratio_to_product_high']:.2f})",
+            f"{row['authors_to_distances']:.1f} ×",
+        )
+        for row in rows
+    ]
+    machine = {"processors": processors(), "threads": threads, "device": device}
+    return Result(
+        {"machine": machine, "count": count, "repeats": repeats, "seed": seed, "rows": rows},
+        [
+            Table(f"{count} × {count} distances in float32", COLUMNS, shown),
+            f"Of {repeats} repeats: median times, and medians of their ratios (smallest to largest "
+            f"in brackets); {processors()} processors. docs/contributing.md says how to read it.",
+        ],
+    )
+
+
+def time_in_turn(
+    probes: Probes,
+    templates: SubspaceBatch,
+    metric: Metric,
+    *,
+    repeats: int,
+    threads: int | None,
+) -> dict[str, float]:
+    """Time product, distances and the authors' formula in turn; medians, and ratios in a repeat."""
+    left, right = _stacked(probes), _stacked(templates)
+    table = np.empty((len(left), len(right)), dtype=np.float32)
+    some = slice(min(AUTHORS_COUNT, len(templates)))
+    share = (len(templates) / some.stop) ** 2
+    times = np.empty((repeats + 1, 3))
+    for row in times:
+        row[0] = _milliseconds(lambda: np.matmul(left, right.T, out=table))
+        time.sleep(REST_S)
+        row[1] = _milliseconds(
+            lambda: pairwise_distances(probes, templates, metric=metric, threads=threads)
+        )
+        row[2] = _milliseconds(lambda: authors_distances(probes[some], templates[some])) * share
+    whole, ours, authors = times[1:].T  # the first round only fetches code and memory
+    return {
+        "product_ms": statistics.median(whole),
+        "distances_ms": statistics.median(ours),
+        "authors_ms": statistics.median(authors),
+        "ratio_to_product": statistics.median(ours / whole),
+        "ratio_to_product_low": float((ours / whole).min()),
+        "ratio_to_product_high": float((ours / whole).max()),
+        "authors_to_distances": statistics.median(authors / ours),
+    }
+
+
+def authors_distances(probes: Probes, templates: SubspaceBatch) -> Array32:
+    """Euclidean distances by the formulas of the paper (eq. 1 and 5), as its authors compute them.
+
+    Pair by pair from the closest points, whose coefficients are found by the inverse of a matrix;
+    it is singular where two subspaces share two decoys, and the result is then anything.
+    """
+    feet, bases = templates.feet, templates.bases
+    out = np.empty((len(probes), len(templates)), dtype=np.float32)
+    for i in range(len(out)):
+        if isinstance(probes, SubspaceBatch):
+            foot, basis = probes.feet[i], probes.bases[i]
+            gaps = feet - foot
+            cross = basis @ bases.transpose(0, 2, 1)  # (T, m_D, m_E)
+            inside, across = gaps @ basis.T, (bases @ gaps[:, :, None])[:, :, 0]
+            system = np.eye(templates.m) - cross.transpose(0, 2, 1) @ cross
+            wanted = (cross.transpose(0, 2, 1) @ inside[:, :, None])[:, :, 0] - across
+            try:
+                beta = (np.linalg.inv(system) @ wanted[:, :, None])[:, :, 0]
+            except np.linalg.LinAlgError:
+                beta = np.full_like(wanted, np.nan)
+            alpha = inside + (cross @ beta[:, :, None])[:, :, 0]
+            ends = feet + (beta[:, None] @ bases)[:, 0] - foot - alpha @ basis
+        else:
+            gaps = probes[i] - feet
+            ends = gaps - ((bases @ gaps[:, :, None]).transpose(0, 2, 1) @ bases)[:, 0]
+        out[i] = np.linalg.norm(ends, axis=1)
+    return out
+
+
+def face_like(count: int, n: int, *, stream: Keystream) -> Array32:
+    """Embeddings of nobody, (count, n) unit rows spread like faces: a mean, a steep spectrum."""
+    rows = stream.normal((count, n)) / np.sqrt(1 + np.arange(n) / 8) + 0.3 * (np.arange(n) == 0)
+    embeddings: Array32 = (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
+    return embeddings
+
+
+def face_like_templates(count: int, m: int, n: int, *, stream: Keystream) -> SubspaceBatch:
+    """Templates of such embeddings, each with m others as decoys of its own."""
+    members = face_like(count * (m + 1), n, stream=stream).reshape(count, m + 1, n)
+    return SubspaceBatch.through(members[:, 0], members[:, 1:] - members[:, :1], stream=stream)
+
+
+def _milliseconds(task: Callable[[], object]) -> float:
+    start = time.perf_counter_ns()
+    task()
+    return (time.perf_counter_ns() - start) / 1e6
+
+
+def _stacked(side: Probes) -> NDArray[np.floating]:
+    """Rows whose products with those of another side are the Gram matrix."""
+    if not isinstance(side, SubspaceBatch):
+        return side
+    return np.concatenate([side.feet[:, None], side.bases], axis=1).reshape(-1, side.n)

@@ -1,0 +1,224 @@
+"""``veilface bench models``: with which settings a pack answers soonest, and with which most often.
+
+Each graph is timed alone, and whole photos from their bytes to their embedding, sent by several
+callers at once through as many compute slots as a service would have. What is compared is timed in
+turn, so that what else the machine does meets it alike.
+"""
+
+import statistics
+import time
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from itertools import product
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from api.cli.console import demo_notice, progress
+from api.cli.errors import CommandError, UsageError
+from api.cli.files import read_photo
+from api.cli.inputs import listed_numbers
+from api.cli.results import Result, Table, reports
+from api.settings import MAX_ONNX_THREADS, Settings, processors
+from models.errors import ModelError
+from models.pack import ModelPack
+from models.synthetic import draw_face, encode_photo
+
+DEFAULT_THREADS: int = Settings.model_fields["onnx_threads"].default
+PHOTOS_EACH = 4
+"""Photos that each caller sends in one repeat."""
+DRAWN, PEOPLE = 4, 40
+"""Photos that are drawn, of so many people at most: a detector does not take each for a face."""
+# What a photo costs is asked, not whether the gate lets it pass.
+_embed = partial(ModelPack.embed_photo, policy=None, quality=None)
+
+
+@dataclass(frozen=True)
+class Row:
+    """Whole photos with one setting: medians over the repeats.
+
+    ``compute_slots`` is at most ``callers``, since further slots would stay empty. ``p50_ms`` is
+    the time from a call to its embedding, the wait for a slot included.
+    """
+
+    callers: int
+    onnx_threads: int
+    compute_slots: int
+    photos_per_s: float
+    photos_per_s_low: float
+    photos_per_s_high: float
+    p50_ms: float
+    cpu_ms: float
+
+
+@reports("pack", "providers")
+def models(
+    *,
+    settings: Settings,
+    photo: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="A photo with a face; repeat for more. Unset: some are drawn.", show_default=False
+        ),
+    ] = None,
+    threads: Annotated[
+        str | None,
+        typer.Option(
+            help="Values of `onnx_threads` to try beside its default. Unset: 1, 2, 4 and 8, as far "
+            "as there are processors.",
+            show_default=False,
+        ),
+    ] = None,
+    repeats: Annotated[
+        int, typer.Option(min=1, help="Timed repeats; medians of them are shown.")
+    ] = 9,
+) -> Result:
+    """Time a pack, and say which `onnx_threads` and `compute_slots` suit this machine.
+
+    Needs: a pack. Run it where the service will run, and while little else runs there. Whole
+    photos are timed with one caller, with as many as there are processors, and with twice as many.
+    Takes some minutes.
+
+    Example: `veilface bench models --pack ~/.insightface/models/buffalo_l`
+    """
+    if settings.pack is None:
+        raise UsageError("a pack is what is timed; name it with --pack")
+    here = processors()
+    if threads is None:
+        threads = ",".join(str(count) for count in (1, 2, 4, 8) if count <= here)
+    tried = listed_numbers(threads, "--threads", least=1, most=MAX_ONNX_THREADS)
+    own = {str(path): read_photo(path, settings.max_image_bytes) for path in photo or ()}
+    packs = {
+        count: ModelPack.load(settings.pack, providers=settings.providers, threads=count)
+        for count in sorted({DEFAULT_THREADS, *tried})
+    }
+    info = packs[DEFAULT_THREADS].info
+    rows = time_photos(packs, own, repeats=repeats, here=here)
+    advised = advice(rows)
+    notice = demo_notice(info.embedder_sha256, n=info.n)
+    columns = tuple(Row.__dataclass_fields__)
+    shown = [[_cell(getattr(row, name)) for name in columns] for row in rows]
+    return Result(
+        {
+            "pack": info.name,
+            "processors": here,
+            "providers": settings.providers,
+            "repeats": repeats,
+            "photos": rows,
+            "advice": advised,
+            **notice,
+        },
+        [
+            Table(f"Whole photos, {info.name}", columns, shown),
+            f"Medians of {repeats} repeats on {here} processors.",
+            advised,
+        ],
+    )
+
+
+def _cell(value: float) -> str:
+    return f"{value:.2f}" if isinstance(value, float) else str(value)
+
+
+def time_photos(
+    packs: Mapping[int, ModelPack], own: Mapping[str, bytes], *, repeats: int, here: int
+) -> list[Row]:
+    """Time photos with all settings; the first round only fetches code and memory.
+
+    Parameters
+    ----------
+    packs
+        The pack by its number of threads.
+    own
+        Photos by their names; drawn ones where there are none.
+
+    Raises
+    ------
+    CommandError
+        A photo cannot be embedded, or the pack sees no face in what is drawn.
+    """
+    photos = _usable(packs[DEFAULT_THREADS], own)
+    keys = [
+        (callers, threads, slots)
+        for callers, threads in product(sorted({1, here, 2 * here}), packs)
+        for slots in sorted({min(callers, max(1, s)) for s in (here // 2, here, 2 * here)})
+    ]
+    loads = np.empty((repeats + 1, len(keys), 3))
+    with progress("measuring", loads.shape[0] * len(keys)) as advance:
+        for turn in loads:
+            for place, (callers, threads, slots) in enumerate(keys):
+                turn[place] = _load(packs[threads], photos, callers=callers, slots=slots)
+                advance(1)
+    rates, waits, costs = loads[1:].transpose(2, 1, 0)
+    return [
+        Row(*key, float(np.median(rate)), float(rate.min()), float(rate.max()),
+            float(np.median(wait)), float(np.median(cost)))
+        for key, rate, wait, cost in zip(keys, rates, waits, costs, strict=True)
+    ]  # fmt: skip
+
+
+def advice(rows: Sequence[Row]) -> str:
+    """Say which settings answer most photos a second at full load, and one photo soonest.
+
+    Medians decide; the defaults stand beside them.
+    """
+    full = [row for row in rows if row.callers == max(row.callers for row in rows)]
+    single = [row for row in rows if row.callers == 1]
+    most = max(full, key=lambda row: row.photos_per_s)
+    soonest = min(single, key=lambda row: row.p50_ms)
+    usual = next(
+        row
+        for row in full
+        if (row.onnx_threads, row.compute_slots) == (DEFAULT_THREADS, processors())
+    )
+    alone = next(row for row in single if row.onnx_threads == DEFAULT_THREADS)
+    return (
+        f"onnx_threads = {most.onnx_threads} and compute_slots = {most.compute_slots} answer most "
+        f"photos a second here ({most.photos_per_s:.1f}; {usual.photos_per_s:.1f} with the "
+        f"defaults); onnx_threads = {soonest.onnx_threads} answers a single photo soonest "
+        f"({soonest.p50_ms:.1f} ms; {alone.p50_ms:.1f} ms with the default)."
+    )
+
+
+def _load(
+    pack: ModelPack, photos: Sequence[bytes], *, callers: int, slots: int
+) -> tuple[float, float, float]:
+    """Embed each photo equally often; photos a second, median ms of a call, processor ms."""
+    calls = [*photos] * -(-callers * PHOTOS_EACH // len(photos))
+    # Who waits gets the next free slot in order of coming, as in the service.
+    with ThreadPoolExecutor(slots) as computing, ThreadPoolExecutor(callers) as calling:
+
+        def call(photo: bytes) -> float:
+            start = time.perf_counter()
+            computing.submit(_embed, pack, photo).result()
+            return (time.perf_counter() - start) * 1000
+
+        wall, cpu = time.perf_counter(), time.process_time()
+        times = list(calling.map(call, calls))
+        spent = time.perf_counter() - wall, (time.process_time() - cpu) * 1000
+    return len(calls) / spent[0], statistics.median(times), spent[1] / len(calls)
+
+
+def _usable(pack: ModelPack, own: Mapping[str, bytes]) -> list[bytes]:
+    """Photos that the pack can embed: one's own, or drawn ones of people who do not exist."""
+    for name, photo in own.items():
+        try:
+            _embed(pack, photo)
+        except ModelError as error:
+            raise CommandError(f"{name}: {error}") from error
+    if own:
+        return list(own.values())
+    if pack.info.detector is None:
+        return [encode_photo(draw_face(who, size=pack.crop_size)) for who in range(DRAWN)]
+    photos: list[bytes] = []
+    for who in range(PEOPLE):
+        picture = np.pad(draw_face(who, size=224), ((128, 128), (208, 208), (0, 0)), "edge")
+        if pack.detect(picture):
+            photos.append(encode_photo(picture))
+        if len(photos) == DRAWN:
+            return photos
+    raise CommandError("the pack's detector sees no face in drawn photos; name others with --photo")
