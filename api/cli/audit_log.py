@@ -8,11 +8,12 @@ from typing import Annotated, Any
 
 import typer
 
-from api.cli.console import emit, message, progress, say, say_lines
+from api.cli.console import message, progress, say_lines
 from api.cli.errors import UsageError
 from api.cli.files import read_bounded
-from api.cli.options import STORE, AsJson, takes_settings
+from api.cli.options import STORE, takes_settings
 from api.cli.public_key import PublicKey, read_public_key
+from api.cli.results import Result, reports
 from api.http.audit import operator
 from api.http.values import iso_time
 from api.service.opening import checked_store
@@ -35,7 +36,7 @@ def audit_log() -> None:
 
 
 @app.command()
-@takes_settings(*STORE)
+@reports(*STORE)
 def verify(
     *,
     settings: Settings,
@@ -46,8 +47,7 @@ def verify(
             "put back to an older state, head and all, is found too."
         ),
     ] = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Result:
     """Check the audit log, and keys and lockouts against it; exit status 1 if anything is wrong.
 
     Names the first line that was altered, removed, added or moved. Where the log is whole, names
@@ -67,36 +67,32 @@ def verify(
     ):
         report, records = store.verify_audit_log(anchor=kept, progress=advance)
     problem, intact = report.problem, report.intact and not records
-    if as_json:
-        emit(
-            {
-                "intact": intact,
-                "lines": report.lines,
-                "head": str(report.head),
-                "problem": None
-                if problem is None
-                else {"sequence": problem.sequence, "problem": problem.what},
-                "records": [{"problem": record.what, "about": record.about} for record in records],
-            }
-        )
-    elif intact:
+    facts = {
+        "intact": intact,
+        "lines": report.lines,
+        "head": str(report.head),
+        "problem": problem and {"sequence": problem.sequence, "problem": problem.what},
+        "records": [{"problem": record.what, "about": record.about} for record in records],
+    }
+    if intact:
         checked = "" if kept is None else f", and holds the head of line {kept.sequence}"
-        say(f"The audit log is intact: {report.lines} lines{checked}.")
-        say("Keys, tenants, enrollments and counts of failed attempts are as it tells.")
-    if not intact:
-        if problem is not None:
-            message(f"line {problem.sequence}: {problem.what}")
-        for record in records[:PROBLEMS_SHOWN]:
-            message(f"{record.about}: {record.what}")
-        if len(records) > PROBLEMS_SHOWN:
-            message(f"… and {len(records) - PROBLEMS_SHOWN} more")
-        what = "the audit log was" if not report.intact else "records of the database were"
-        message(f"error: {what} tampered with, or damaged")
-        raise typer.Exit(1)
+        text = [
+            f"The audit log is intact: {report.lines} lines{checked}.",
+            "Keys, tenants, enrollments and counts of failed attempts are as it tells.",
+        ]
+        return Result(facts, text)
+    if problem is not None:
+        message(f"line {problem.sequence}: {problem.what}")
+    for record in records[:PROBLEMS_SHOWN]:
+        message(f"{record.about}: {record.what}")
+    if len(records) > PROBLEMS_SHOWN:
+        message(f"… and {len(records) - PROBLEMS_SHOWN} more")
+    what = "the audit log was" if not report.intact else "records of the database were"
+    return Result(facts, error=f"{what} tampered with, or damaged")
 
 
 @app.command()
-@takes_settings(*STORE)
+@reports(*STORE)
 def archive(
     file: Annotated[Path, typer.Argument(help="New file for the lines.")],
     *,
@@ -105,8 +101,7 @@ def archive(
         int | None,
         typer.Option(min=1, help="Number of the last line to move. Unset: all there are."),
     ] = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Result:
     """Move old lines of the audit log into a signed file.
 
     The lines are verified first, and go from the database once the file is on disk. The log goes on
@@ -116,16 +111,16 @@ def archive(
     """
     with checked_store(settings) as store:
         moved = store.archive_audit_log(file, through=through, by=operator())
-    _show_archive(moved, as_json, f"Moved {moved.lines} lines into {file}.")
+    return _archived(moved, f"Moved {moved.lines} lines into {file}.")
 
 
 @app.command("verify-archive")
+@reports()
 def verify_archive_file(
     file: Annotated[Path, typer.Argument(help="What `archive` wrote.")],
     *,
     public_key: PublicKey,
-    as_json: AsJson = False,
-) -> None:
+) -> Result:
     """Check an archive's signature and lines; exit status 1 if they are not good.
 
     Needs no service and no other key.
@@ -133,20 +128,19 @@ def verify_archive_file(
     Example: `veilface audit-log verify-archive audit-2026.jsonl --public-key contract.json`
     """
     checked = verify_archive(file, read_public_key(public_key))
-    _show_archive(checked, as_json, f"{file} is intact: {checked.lines} lines.")
+    return _archived(checked, f"{file} is intact: {checked.lines} lines.")
 
 
-def _show_archive(archived: Archive, as_json: bool, sentence: str) -> None:
-    if as_json:
-        emit({"lines": archived.lines, "base": str(archived.base), "last": str(archived.last)})
-        return
-    say(sentence)
-    say(f"Its lines follow on {archived.base} and end with {archived.last}.")
+def _archived(archived: Archive, sentence: str) -> Result:
+    return Result(
+        {"lines": archived.lines, "base": str(archived.base), "last": str(archived.last)},
+        [sentence, f"Its lines follow on {archived.base} and end with {archived.last}."],
+    )
 
 
 @app.command()
-@takes_settings(*STORE)
-def head(*, settings: Settings, as_json: AsJson = False) -> None:
+@reports(*STORE)
+def head(*, settings: Settings) -> Result:
     """Print the number and MAC of the last line, to be kept elsewhere.
 
     Keep it where the database administrator cannot write: `verify --anchor` then detects a log that
@@ -156,10 +150,7 @@ def head(*, settings: Settings, as_json: AsJson = False) -> None:
     """
     with checked_store(settings) as store:
         last = store.audit_log.head()
-    if as_json:
-        emit({"sequence": last.sequence, "mac": last.mac.hex()})
-    else:
-        say(str(last))
+    return Result({"sequence": last.sequence, "mac": last.mac.hex()}, str(last))
 
 
 @app.command()

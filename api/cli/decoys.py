@@ -9,12 +9,12 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from api.cli.console import demo_notice, emit, message, say
+from api.cli.console import demo_notice, message
 from api.cli.descriptors import BULK, Aligned, Cache, Flip, bulk_pack, extract
 from api.cli.errors import CommandError, UsageError
 from api.cli.files import is_left_out, read_names
-from api.cli.options import AsJson, takes_settings
 from api.cli.photo_folders import find_photos
+from api.cli.results import Result, reports
 from api.process.preparation import (
     LikeSample,
     acquired,
@@ -45,7 +45,7 @@ def decoys() -> None:
 
 
 @app.command()
-@takes_settings(*BULK)
+@reports(*BULK)
 def build(
     photos: Annotated[
         list[Path],
@@ -94,8 +94,7 @@ def build(
     aligned: Aligned = False,
     flip: Flip = False,
     cache: Cache = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Result:
     """Make the lifting database from folders of face photos.
 
     Needs: a model pack, and photos of at least 100 people (better 2,000 or more) who will never be
@@ -138,28 +137,6 @@ def build(
         source.save(path, file_sealer(open_keyring(settings)))
     notice = demo_notice(pack.info.embedder_sha256, n=pack.info.n)
     labelled = attributes is not None and kind is Kind.POOL
-    if as_json:
-        emit(
-            {
-                "out": str(path),
-                "kind": str(kind),
-                "source_id": source.source_id,
-                "made_with": source.made_with,
-                "n": source.n,
-                "descriptors": len(extraction.descriptors),
-                "like": len(kind_of.people) if kind_of else 0,
-                "labelled": labelled,
-                "left_out": left_out,
-                "failure_to_acquire": acquired_json(extraction),
-                **notice,
-            }
-        )
-        return
-    made = f"{kind} from {len(extraction.descriptors)} embeddings"
-    if kind_of is not None:
-        made += f", adapted to {len(kind_of.people)} of --like"
-    say(f"{path}: {made}{', labelled' if labelled else ''}, id {source.source_id[:16]}.")
-    say(f"{acquired(extraction)}{f'; {left_out:,} left out by --exclude' if left_out else ''}.")
     if kind_of is not None:
         message(
             "note: never enroll the people of --like, and leave them out of the calibration: "
@@ -170,6 +147,28 @@ def build(
             "note: people in a pool are accepted by every template that uses them as a decoy; "
             "never enroll them"
         )
+    made = f"{kind} from {len(extraction.descriptors)} embeddings"
+    if kind_of is not None:
+        made += f", adapted to {len(kind_of.people)} of --like"
+    if labelled:
+        made += ", labelled"
+    excluded = f"; {left_out:,} left out by --exclude" if left_out else ""
+    return Result(
+        {
+            "out": path,
+            "kind": kind,
+            "source_id": source.source_id,
+            "made_with": source.made_with,
+            "n": source.n,
+            "descriptors": len(extraction.descriptors),
+            "like": len(kind_of.people) if kind_of else 0,
+            "labelled": labelled,
+            "left_out": left_out,
+            "failure_to_acquire": acquired_json(extraction),
+            **notice,
+        },
+        [f"{path}: {made}, id {source.source_id[:16]}.", f"{acquired(extraction)}{excluded}."],
+    )
 
 
 def photos_of(folders: Sequence[Path], names: frozenset[str]) -> tuple[list[Path], int]:
@@ -190,8 +189,4 @@ def _labels(folders: Sequence[Path], named: Path | None) -> dict[Path, Attribute
     files = [named] if named is not None else [f for one in folders for f in label_files(one)]
     if not files:
         return None
-    merged: dict[Path, Attributes] = {}
-    for file in files:
-        for path, label in read_labels(file).items():
-            merged[path] = label.attributes
-    return merged
+    return {path: label.attributes for file in files for path, label in read_labels(file).items()}

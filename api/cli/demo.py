@@ -9,13 +9,14 @@ from typing import Annotated, Any
 
 import typer
 
-from api.cli.console import emit, message, say, show, table
-from api.cli.options import AsJson
+from api.cli.console import message
+from api.cli.results import Result, Table, reports
 from api.cli.verdict import verdict_lines
 from api.demo.run import Outcome, run_demo
 from models.demo import DEMO_NOTICE
 
 
+@reports()
 def demo(
     *,
     folder: Annotated[
@@ -36,8 +37,7 @@ def demo(
         ),
     ] = None,
     dim: Annotated[int, typer.Option(min=1, max=128, help="Dimension m of the templates.")] = 16,
-    as_json: AsJson = False,
-) -> None:
+) -> Result:
     """Enroll, verify and erase people through the real service, in under a minute.
 
     Needs nothing: no weights, no database, no network. It draws faces, makes decoys and a
@@ -51,80 +51,76 @@ def demo(
     outcome = run_demo(
         folder, pack=pack, faces=faces, m=dim, say=lambda text: message(f"... {text}")
     )
-    if as_json:
-        emit(_json(outcome))
-    else:
-        _print(outcome)
-    for fault in outcome.faults:
+    for fault in outcome.faults[:-1]:
         message(f"error: {fault}")
-    if outcome.faults:
-        raise typer.Exit(1)
+    return Result(_facts(outcome), _text(outcome), error=next(iter(outcome.faults[-1:]), None))
 
 
-def _print(outcome: Outcome) -> None:
+def _text(outcome: Outcome) -> list[str | Table]:
     notice = f"  ({DEMO_NOTICE})" if outcome.demo_model else ""
-    if outcome.demo_model:
-        say(f"\n{DEMO_NOTICE}\n")
-    people = table(
-        f"Who was accepted, at level {outcome.default_level}{notice}",
-        "person",
-        "own photos",
-        "photos of others",
-    )
-    for person in outcome.people:
-        people.add_row(
-            person.name,
-            f"{person.genuine_accepted} of {person.genuine_trials} accepted",
-            f"{person.impostor_trials - person.impostors_accepted} of {person.impostor_trials} "
-            "rejected",
-        )
-    levels = table(
-        f"Security levels{notice}",
-        "level",
-        "stated FMR",
-        "genuine accepted",
-        "impostors accepted",
-    )
-    for level in outcome.levels:
-        levels.add_row(
-            level.level,
-            f"{100 * level.fmr:g} %",
-            f"{level.genuine_accepted} of {level.genuine_trials}",
-            f"{level.impostors_accepted} of {level.impostor_trials}",
-        )
-    stored = table(
-        f"What is stored: {outcome.strategy}{notice}",
-        "person",
-        "template",
-        "‖p‖ = cos(face, foot point)",
-        "in the database",
-        "16 bytes of it (ciphertext)",
-    )
-    for entry in outcome.stored:
-        stored.add_row(
-            entry.name,
-            f"{entry.template_bytes} bytes",
-            f"{entry.foot_norm:.3f}",
-            f"{entry.ciphertext_bytes} bytes, AES-256-GCM",
-            entry.ciphertext_excerpt,
-        )
-    show(people, levels, stored)
+    text: list[str | Table] = [f"\n{DEMO_NOTICE}\n"] if outcome.demo_model else []
+    text += [
+        Table(
+            f"Who was accepted, at level {outcome.default_level}{notice}",
+            ("person", "own photos", "photos of others"),
+            [
+                (
+                    one.name,
+                    f"{one.genuine_accepted} of {one.genuine_trials} accepted",
+                    f"{one.impostor_trials - one.impostors_accepted} of {one.impostor_trials} "
+                    "rejected",
+                )
+                for one in outcome.people
+            ],
+        ),
+        Table(
+            f"Security levels{notice}",
+            ("level", "stated FMR", "genuine accepted", "impostors accepted"),
+            [
+                (
+                    one.level,
+                    f"{100 * one.fmr:g} %",
+                    f"{one.genuine_accepted} of {one.genuine_trials}",
+                    f"{one.impostors_accepted} of {one.impostor_trials}",
+                )
+                for one in outcome.levels
+            ],
+        ),
+        Table(
+            f"What is stored: {outcome.strategy}{notice}",
+            (
+                "person",
+                "template",
+                "‖p‖ = cos(face, foot point)",
+                "in the database",
+                "16 bytes of it (ciphertext)",
+            ),
+            [
+                (
+                    one.name,
+                    f"{one.template_bytes} bytes",
+                    f"{one.foot_norm:.3f}",
+                    f"{one.ciphertext_bytes} bytes, AES-256-GCM",
+                    one.ciphertext_excerpt,
+                )
+                for one in outcome.stored
+            ],
+        ),
+    ]
     if outcome.locks_lifted:
-        say(
+        text.append(
             f"Five rejections in a row locked subjects {outcome.locks_lifted} times; each time the "
             "demo lifted the lock, as an operator can."
         )
-    for refusal in outcome.refused_photos:
-        say(f"Not usable, counted as rejected: {refusal}")
+    text += [f"Not usable, counted as rejected: {refusal}" for refusal in outcome.refused_photos]
     if outcome.receipt:
-        say(
+        text.append(
             f"Erased {outcome.erased}: {outcome.rows_after_erasure} rows left, and a valid signed "
             f"receipt for the pseudonym {outcome.receipt['subject'][:16]}…"
         )
-    for line in verdict_lines(outcome.verdict):
-        say(line)
+    text += verdict_lines(outcome.verdict)
     folder = outcome.folder
-    say(
+    text.append(
         f"\nDone in {outcome.seconds:.0f} s. Start the service on the same data:\n\n"
         f"  {_program()} serve --config {folder}/veilface.toml\n\n"
         "and open http://127.0.0.1:8421/ with the API key, which is in a file that only you can "
@@ -133,8 +129,7 @@ def _print(outcome: Outcome) -> None:
         f'  curl -H "Authorization: Bearer $(cat {folder}/api-key)" '
         "http://127.0.0.1:8421/v1/subjects\n"
     )
-    if outcome.demo_model:
-        say(DEMO_NOTICE)
+    return [*text, DEMO_NOTICE] if outcome.demo_model else text
 
 
 def _program() -> str:
@@ -145,10 +140,9 @@ def _program() -> str:
     return os.path.relpath(program)
 
 
-def _json(outcome: Outcome) -> dict[str, Any]:
-    value = dataclasses.asdict(outcome)
-    value["folder"] = str(outcome.folder)
-    value["verdict"] = None if outcome.verdict is None else outcome.verdict.to_json()
-    if outcome.demo_model:
-        value["notice"] = DEMO_NOTICE
-    return value
+def _facts(outcome: Outcome) -> dict[str, Any]:
+    notice = {"notice": DEMO_NOTICE} if outcome.demo_model else {}
+    return {
+        **{part.name: getattr(outcome, part.name) for part in dataclasses.fields(outcome)},
+        **notice,
+    }

@@ -7,10 +7,10 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from api.cli.console import counted, demo_notice, emit, say
+from api.cli.console import counted, demo_notice
 from api.cli.errors import CommandError, UsageError
 from api.cli.files import MAX_CONTRACT_BYTES, read_bounded, read_photo
-from api.cli.options import AsJson
+from api.cli.results import Result, as_json, reports
 from enroll.enroller import MAX_PHOTOS
 from enroll.public_contract import PublicContract
 from models.errors import ModelError
@@ -25,6 +25,7 @@ from templates.space.agreement import InconsistentImages
 MAX_PHOTO_BYTES = 64 * 2**20
 
 
+@reports()
 def lift(
     photos: Annotated[
         list[Path],
@@ -81,8 +82,7 @@ def lift(
             help="With `--out -`: private file with the holder's key, which the body will carry."
         ),
     ] = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Result:
     """Make a private template from photos on this machine, without any secret of the service.
 
     Needs: the service's model pack, `GET /v1/contract` and `GET /v1/contract/generator` saved to
@@ -124,25 +124,22 @@ def lift(
     notice = demo_notice(info.embedder_sha256, n=info.n)
     if str(out) == "-":
         asked = {} if level is None else {"level": level}
-        emit({"template": base64.b64encode(data).decode("ascii"), **asked, **holder_key})
-        return
+        body = {"template": base64.b64encode(data).decode("ascii"), **asked, **holder_key}
+        return Result(body, as_json(body))
     replace_private(out, data)
-    facts: dict[str, Any] = {
-        "out": str(out),
-        "bytes": len(data),
-        "kind": "probe" if probe else "enrollment",
-        "m": m,
-        "photos": len(photos),
-        "contract_id": public.contract_id,
-        **notice,
-    }
-    if as_json:
-        emit(facts)
-    else:
-        say(
-            f"{out}: {facts['kind']} template of {counted(len(photos), 'photo')}, m = {m}, "
-            f"{len(data)} bytes."
-        )
+    kind = "probe" if probe else "enrollment"
+    return Result(
+        {
+            "out": out,
+            "bytes": len(data),
+            "kind": kind,
+            "m": m,
+            "photos": len(photos),
+            "contract_id": public.contract_id,
+            **notice,
+        },
+        f"{out}: {kind} template of {counted(len(photos), 'photo')}, m = {m}, {len(data)} bytes.",
+    )
 
 
 def embed_file(pack: ModelPack, photo: Path, *, policy: FacePolicy) -> np.ndarray[Any, Any]:

@@ -9,10 +9,10 @@ from typing import Annotated, Literal
 
 import typer
 
-from api.cli.console import demo_notice, download, emit, message, say, show, table
+from api.cli.console import counted, demo_notice, download, message
 from api.cli.errors import CommandError, UsageError
-from api.cli.options import AsJson
 from api.cli.pack_download import obtained, shown
+from api.cli.results import Result, Table, reports
 from models.errors import ModelError, PackError
 from models.known_packs import KNOWN_PACKS
 from models.liveness import LivenessGraph
@@ -22,8 +22,6 @@ from models.pack_graphs import inspect as inspect_pack
 from templates.keys.private_file import replace_public
 
 NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,63}")
-MAX_NAMES, MAX_NAME = 10, 100
-"""How many names of what an archive has beside graphs are shown, and characters of each."""
 
 app = typer.Typer(no_args_is_help=True)
 
@@ -34,6 +32,7 @@ def models() -> None:
 
 
 @app.command()
+@reports()
 def fetch(
     name: Annotated[
         str,
@@ -70,8 +69,7 @@ def fetch(
         bool,
         typer.Option("--accept-licence", help="You have read the licence and may use the weights."),
     ] = False,
-    as_json: AsJson = False,
-) -> None:
+) -> Result:
     """Fetch a pack from an address that you name, and check that it can be used.
 
     Shows licence and size first, and the SHA-256 of what came. Veilface keeps no addresses of
@@ -106,20 +104,22 @@ def fetch(
         folder.mkdir(parents=True, exist_ok=True)
         digests = {}
         for source, pin in zip(sources, pins, strict=True):
-            digests[shown(source)], left_out = _fetch_one(source, folder, pin)
-            message(f"{shown(source)}: SHA-256 {digests[shown(source)]}")
+            with download("fetching") as begin:
+                digest, left_out = obtained(source, folder, sha256=pin, begin=begin)
+            digests[shown(source)] = digest
+            message(f"{shown(source)}: SHA-256 {digest}")
             if left_out:
-                message(f"Left in the archive: {_some_of(left_out)}.")
+                message(f"Left in the archive: {counted(left_out, 'file')}.")
         if preprocessing is not None:
             if (folder / FILE_NAME).exists():
                 raise UsageError(f"the archive has a {FILE_NAME}: leave out --preprocessing")
             replace_public(folder / FILE_NAME, pack_file_text(preprocessing).encode())
         pack = ModelPack.load(folder)
         folder.rename(target)
-    if as_json:
-        emit({"out": str(target), "sha256": digests, "pack": _described(pack)})
-    else:
-        say(f"{target}: {_usable(pack.info)}")
+    return Result(
+        {"out": target, "sha256": digests, "pack": _described(pack)},
+        f"{target}: {_usable(pack.info)}",
+    )
 
 
 def _require_licence(accepted: bool) -> None:
@@ -128,17 +128,6 @@ def _require_licence(accepted: bool) -> None:
     if not sys.stdin.isatty():
         raise UsageError("say --accept-licence once you have read the licence of the weights")
     typer.confirm("Have you read the licence, and may you use the weights?", abort=True, err=True)
-
-
-def _fetch_one(source: str, folder: Path, pin: str | None) -> tuple[str, list[str]]:
-    with download("fetching") as begin:
-        return obtained(source, folder, sha256=pin, begin=begin)
-
-
-def _some_of(names: Sequence[str]) -> str:
-    first = ", ".join(name[:MAX_NAME] for name in names[:MAX_NAMES])
-    more = len(names) - MAX_NAMES
-    return f"{first}, and {more:,} more" if more > 0 else first
 
 
 def _described(pack: ModelPack) -> dict[str, object]:
@@ -174,14 +163,13 @@ def _usable(info: PackInfo) -> str:
 
 
 @app.command()
+@reports()
 def inspect(
     pack: Annotated[
         Path,
         typer.Argument(help="Folder of .onnx files, or one embedder file."),
     ],
-    *,
-    as_json: AsJson = False,
-) -> None:
+) -> Result:
     """Show what each graph of a pack is, and whether Veilface can use the pack.
 
     Needs: a folder of `.onnx` files such as InsightFace's `buffalo_l`, or one `.onnx` embedder.
@@ -195,44 +183,33 @@ def inspect(
         loaded, refusal = ModelPack.load(pack), ""
     except ModelError as error:
         loaded, refusal = None, str(error)
-    if as_json:
-        emit(
-            {
-                "usable": loaded is not None,
-                "reason": refusal or None,
-                "graphs": [
-                    {
-                        "file": graph.file,
-                        "role": str(graph.role),
-                        "reason": graph.reason,
-                        "sha256": graph.sha256,
-                        "inputs": graph.inputs,
-                        "outputs": graph.outputs,
-                    }
-                    for graph in graphs
-                ],
-                "pack": None if loaded is None else _described(loaded),
-            }
+    text: list[str | Table] = [
+        Table(
+            f"Graphs of {pack.name}",
+            ("file", "role", "why", "SHA-256"),
+            [(graph.file, graph.role, graph.reason, graph.sha256[:16]) for graph in graphs],
         )
-    else:
-        listing = table(f"Graphs of {pack.name}", "file", "role", "why", "SHA-256")
-        for graph in graphs:
-            listing.add_row(graph.file, str(graph.role), graph.reason, graph.sha256[:16])
-        show(listing)
-        if loaded is None:
-            say(f"This pack cannot be used: {refusal}")
-        else:
-            say(f"Usable: {_usable(loaded.info)}")
-            members, unusable = _liveness_graphs(loaded)
-            if unusable is not None:
-                say(f"Its liveness graphs cannot be used: {unusable}")
-            for member in members:
-                fed = member.expects
-                say(
-                    f"Liveness: {member.file}, {fed.crop} of the face times {fed.crop_scale:g}, "
-                    f"{fed.size} x {fed.size} {fed.channel_order.upper()}, class {fed.live_class} "
-                    f"is live, score {fed.score}."
-                )
+    ]
     if loaded is None:
-        raise typer.Exit(1)
-    demo_notice(loaded.info.embedder_sha256, n=loaded.info.n)
+        text.append(f"This pack cannot be used: {refusal}")
+    else:
+        demo_notice(loaded.info.embedder_sha256, n=loaded.info.n)
+        text.append(f"Usable: {_usable(loaded.info)}")
+        members, unusable = _liveness_graphs(loaded)
+        if unusable is not None:
+            text.append(f"Its liveness graphs cannot be used: {unusable}")
+        for member in members:
+            fed = member.expects
+            text.append(
+                f"Liveness: {member.file}, {fed.crop} of the face times {fed.crop_scale:g}, "
+                f"{fed.size} x {fed.size} {fed.channel_order.upper()}, class {fed.live_class} "
+                f"is live, score {fed.score}."
+            )
+    names = ("file", "role", "reason", "sha256", "inputs", "outputs")
+    facts = {
+        "usable": loaded is not None,
+        "reason": refusal or None,
+        "graphs": [{name: getattr(graph, name) for name in names} for graph in graphs],
+        "pack": None if loaded is None else _described(loaded),
+    }
+    return Result(facts, text, status=0 if loaded is not None else 1)

@@ -1,10 +1,11 @@
 """Getting the files of a pack from addresses that the user names."""
 
 import hashlib
+import re
 import shutil
 import tempfile
 from collections.abc import Callable
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import IO
 
 import httpx
@@ -14,24 +15,20 @@ from models.archive import MAX_FILE_BYTES, is_archive, unpack
 
 TIMEOUT_S = 30.0
 _LOOPBACK = frozenset({"localhost", "127.0.0.1", "::1"})
-_ONNX = ".onnx"
+_GRAPH_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]*\.onnx", re.IGNORECASE)
 
 Begin = Callable[[int | None], Callable[[int], None]]
 
 
 def shown(source: str) -> str:
-    """A source without what may be secret in an address: user, password and query.
-
-    Of what is no address, though it begins like one, nothing is shown: where a password stands in
-    it is not known.
-    """
+    """Write a source without what may be secret in an address: user, password and query."""
     text = source
     if is_address(source):
         try:
             url = httpx.URL(source)
             text = str(url.copy_with(username=None, password=None, query=None, fragment=None))
         except (httpx.InvalidURL, ValueError):
-            text = f"{source.partition(':')[0]}://…"
+            text = f"{source.partition(':')[0]}://…"  # where a password stands is not known
     return "".join(c if c.isprintable() else "\ufffd" for c in text)
 
 
@@ -40,7 +37,7 @@ def is_address(source: str) -> bool:
     return source.startswith(("http://", "https://"))
 
 
-def obtained(source: str, into: Path, *, sha256: str | None, begin: Begin) -> tuple[str, list[str]]:
+def obtained(source: str, into: Path, *, sha256: str | None, begin: Begin) -> tuple[str, int]:
     """Put the graphs of one source, an archive or a graph, into a folder.
 
     Parameters
@@ -51,14 +48,14 @@ def obtained(source: str, into: Path, *, sha256: str | None, begin: Begin) -> tu
         What the bytes must hash to, in hex; None for anything.
     begin
         Called with the number of bytes to come, where it is known; what it returns is called with
-        the bytes as they come.
+        the number of bytes as they come.
 
     Returns
     -------
     sha256 : str
         Of the bytes.
-    left_out : list of str
-        Names of entries of the archive that are no graphs.
+    left_out : int
+        Entries of the archive that are no graphs.
 
     Raises
     ------
@@ -72,6 +69,7 @@ def obtained(source: str, into: Path, *, sha256: str | None, begin: Begin) -> tu
             _download(source, draft, is_pinned=sha256 is not None, begin=begin)
         else:
             _copy(Path(source), draft)
+        draft.flush()
         draft.seek(0)
         digest = hashlib.file_digest(draft, "sha256").hexdigest()
         if sha256 is not None and digest != sha256.strip().lower():
@@ -79,39 +77,35 @@ def obtained(source: str, into: Path, *, sha256: str | None, begin: Begin) -> tu
                 f"{shown(source)} has SHA-256 {digest}, and not the one of --sha256: do not use it"
             )
         if is_archive(Path(draft.name)):
-            return digest, unpack(Path(draft.name), into)[1]
-        name = _file_name(source)
+            return digest, len(unpack(Path(draft.name), into)[1])
+        name = Path(httpx.URL(source).path if is_address(source) else source).name
+        if not _GRAPH_NAME.fullmatch(name):
+            raise CommandError(
+                f"{shown(source)} is neither a zip archive nor an .onnx file with a name of "
+                "letters, digits and . _ -"
+            )
         if (into / name).exists():
             raise CommandError(f"two sources have a file of the name {name}")
         shutil.copyfile(draft.name, into / name)
-        return digest, []
-
-
-def _file_name(source: str) -> str:
-    path = httpx.URL(source).path if is_address(source) else source
-    name = PurePosixPath(path).name
-    if not name.lower().endswith(_ONNX) or name.startswith("."):
-        raise CommandError(f"{shown(source)} is neither a zip archive nor an .onnx file")
-    if not name.isprintable():
-        raise CommandError(f"{shown(source)} names a file that cannot be printed: rename it")
-    return name
+        return digest, 0
 
 
 def _copy(file: Path, draft: IO[bytes]) -> None:
     if not file.is_file():
         raise CommandError(f"{shown(str(file))} is neither an http(s) address nor a file")
     if file.stat().st_size > MAX_FILE_BYTES:
-        raise CommandError(f"{shown(str(file))} has more than {MAX_FILE_BYTES:,} bytes: not a pack")
+        raise _too_large(str(file))
     with file.open("rb") as source:
         shutil.copyfileobj(source, draft)
-    draft.flush()
 
 
 def _download(source: str, draft: IO[bytes], *, is_pinned: bool, begin: Begin) -> None:
     try:
         with httpx.stream("GET", source, follow_redirects=True, timeout=TIMEOUT_S) as answer:
             hops = [*(hop.url for hop in answer.history), answer.url]
-            if not is_pinned and not all(map(_is_private_way, hops)):
+            if not is_pinned and any(
+                url.scheme != "https" and url.host not in _LOOPBACK for url in hops
+            ):
                 raise CommandError(
                     f"{shown(source)} leads over plain http, where anybody on the way may change "
                     "the file: use https, or pin it with --sha256"
@@ -119,37 +113,17 @@ def _download(source: str, draft: IO[bytes], *, is_pinned: bool, begin: Begin) -
             if answer.status_code != httpx.codes.OK:
                 raise CommandError(f"{shown(source)} answers {answer.status_code}")
             size = answer.headers.get("content-length", "")
-            total = int(size) if size.isdecimal() else None
-            if total is not None and total > MAX_FILE_BYTES:
-                raise _too_large(source)
-            _write(answer, draft, source, advance=begin(total))
-    except httpx.RequestError as error:
+            advance = begin(int(size) if size.isdecimal() else None)
+            for piece in answer.iter_bytes(2**18):
+                if draft.tell() + len(piece) > MAX_FILE_BYTES:
+                    raise _too_large(source)
+                draft.write(piece)
+                advance(len(piece))
+    except (httpx.HTTPError, httpx.InvalidURL, ValueError) as error:
         raise CommandError(
-            f"{shown(source)} cannot be fetched ({type(error).__name__}): without a network, bring "
-            "the file here by other means, and name it with --from FILE"
+            f"{shown(source)} cannot be fetched ({type(error).__name__}): look at it in a browser; "
+            "without a network, bring the file here by other means, and name it with --from FILE"
         ) from None
-    except (httpx.InvalidURL, ValueError) as error:
-        raise CommandError(
-            f"{shown(source)} cannot be fetched ({type(error).__name__}): it is no address, or "
-            "answers what is none of HTTP; look at it in a browser"
-        ) from None
-
-
-def _is_private_way(url: httpx.URL) -> bool:
-    return url.scheme == "https" or url.host in _LOOPBACK
-
-
-def _write(
-    answer: httpx.Response, draft: IO[bytes], source: str, *, advance: Callable[[int], None]
-) -> None:
-    count = 0
-    for piece in answer.iter_bytes(2**18):
-        count += len(piece)
-        if count > MAX_FILE_BYTES:
-            raise _too_large(source)
-        draft.write(piece)
-        advance(len(piece))
-    draft.flush()
 
 
 def _too_large(source: str) -> CommandError:

@@ -43,12 +43,15 @@ class Result:
     text
         What a person reads instead: lines and tables, in order.
     error
-        Why the exit status is 1, on stderr after either; None where it is 0.
+        What is wrong, on stderr after either; the exit status is then 1.
+    status
+        Exit status where nothing is wrong: 1 for a negative answer.
     """
 
     facts: Any
     text: str | Sequence[str | Table] = ()
     error: str | None = None
+    status: int = 0
 
 
 def as_json(value: Any) -> str:
@@ -69,7 +72,7 @@ def _plain(value: Any) -> Any:
 
 
 def present(result: Result, *, json: bool) -> None:
-    """Show a result; raises :class:`typer.Exit` with status 1 where it is an error."""
+    """Show a result; raises :class:`typer.Exit` where the exit status is not 0."""
     if json:
         say(as_json(result.facts))
     else:
@@ -80,7 +83,8 @@ def present(result: Result, *, json: bool) -> None:
                 _show(part)
     if result.error is not None:
         message(f"error: {result.error}")
-        raise typer.Exit(1)
+    if status := result.status or int(result.error is not None):
+        raise typer.Exit(status)
 
 
 def _show(table: Table) -> None:

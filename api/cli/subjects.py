@@ -3,14 +3,15 @@
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from api.cli.console import counted, demo_notice, emit, message, say
+from api.cli.console import counted, demo_notice, message
 from api.cli.errors import CommandError, UsageError
 from api.cli.files import read_photo
-from api.cli.options import LOCAL, AsJson, Tenant, takes_settings
+from api.cli.options import LOCAL, Tenant
+from api.cli.results import Result, reports
 from api.http.audit import operator
 from api.http.errors import ApiError
 from api.service.opening import weak_privacy
@@ -49,7 +50,7 @@ HolderKeyFile = Annotated[
 ]
 
 
-@takes_settings(*LOCAL)
+@reports(*LOCAL)
 def enroll(
     subject: Subject,
     photos: Annotated[
@@ -84,8 +85,7 @@ def enroll(
             metavar="TEMPLATE_ID", help="Replace the enrollment with this template id only."
         ),
     ] = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Result:
     """Enroll a person from photos, or replace their enrollment.
 
     Needs: what `serve` needs (contract, decoys, pack); the service may run meanwhile. All photos
@@ -140,26 +140,24 @@ def enroll(
     finally:
         wipe(holder_key)
         runtime.close()
-    if as_json:
-        emit(
-            {
-                "subject_id": subject,
-                "tenant": name,
-                "template_id": stored.template_id,
-                "contract_id": enrollment.contract_id,
-                "replaced": not stored.created,
-                "holder_key": enrollment.holder_salt is not None,
-                "photos": len(photos),
-                **notice,
-            }
-        )
-    else:
-        done = "Enrolled" if stored.created else "Replaced the enrollment of"
-        size = len(enrollment.wire)
-        say(f"{done} {subject} from {counted(len(photos), 'photo')}; stored {size} bytes.")
+    done = "Enrolled" if stored.created else "Replaced the enrollment of"
+    return Result(
+        {
+            "subject_id": subject,
+            "tenant": name,
+            "template_id": stored.template_id,
+            "contract_id": enrollment.contract_id,
+            "replaced": not stored.created,
+            "holder_key": enrollment.holder_salt is not None,
+            "photos": len(photos),
+            **notice,
+        },
+        f"{done} {subject} from {counted(len(photos), 'photo')}; stored {len(enrollment.wire)} "
+        "bytes.",
+    )
 
 
-@takes_settings(*LOCAL)
+@reports(*LOCAL)
 def verify(
     subject: Subject,
     photos: Annotated[
@@ -180,8 +178,7 @@ def verify(
     tenant: Tenant = None,
     face: Face = FacePolicy.SINGLE,
     holder_key_file: HolderKeyFile = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Result:
     """Check whether photos show a person; exit status 0 if accepted, 1 if rejected.
 
     Several photos must show one person; they are averaged, and the right person is rejected less
@@ -224,24 +221,21 @@ def verify(
     finally:
         wipe(holder_key)
         runtime.close()
-    answer: dict[str, Any] = {
-        "decision": outcome,
-        "reason": decision.reason,
-        "level": decision.level,
-        "fmr": decision.fmr,
-        "contract_id": decision.contract_id,
-        "calibration_id": decision.calibration_id,
-        **({} if decision.advice is None else {"advice": decision.advice}),
-        **notice,
-    }
-    if as_json:
-        emit(answer)
-    else:
-        say(f"{answer['decision']}: {subject}, level {decision.level}, FMR {decision.fmr:g}")
-        if decision.advice is not None:
-            say(decision.advice)
-    if not decision.accepted:
-        raise typer.Exit(1)
+    advice = [] if decision.advice is None else [decision.advice]
+    return Result(
+        {
+            "decision": outcome,
+            "reason": decision.reason,
+            "level": decision.level,
+            "fmr": decision.fmr,
+            "contract_id": decision.contract_id,
+            "calibration_id": decision.calibration_id,
+            **({"advice": decision.advice} if advice else {}),
+            **notice,
+        },
+        [f"{outcome}: {subject}, level {decision.level}, FMR {decision.fmr:g}", *advice],
+        status=0 if decision.accepted else 1,
+    )
 
 
 @contextmanager
