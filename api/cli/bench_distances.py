@@ -1,7 +1,7 @@
 """``veilface bench distances``: distances beside the matrix product that they cannot do without.
 
-A distance starts from the products of stacked rows (docs/contributing.md "The way of a pair"). All of
-them in one matrix of its own is the *bare product*. The distances and the product are timed in
+A distance starts from the products of stacked rows (docs/contributing.md "Distances"). All
+of them in one matrix of its own is the *bare product*. The distances and the product are timed in
 turn, so that what else the machine does meets them alike, and compared repeat by repeat. Beside
 them stands the paper's formula as its authors compute it, on fewer pairs.
 """
