@@ -73,7 +73,7 @@ def test_the_readme_logs_in_by_the_example(service: Service, tmp_path: Path) -> 
     (tmp_path / "examples").symlink_to(EXAMPLES)
     (tmp_path / "veilface-data-keys").mkdir()
     (tmp_path / "veilface-data-keys" / "api-key").write_text(f"{service.token}\n")
-    (tmp_path / "anna3.jpg").write_bytes(service.photo(1, 4))
+    (tmp_path / "anna5.jpg").write_bytes(service.photo(1, 4))
     with Client(service.url, service.token) as client:
         client.enroll("anna", [service.photo(1, number) for number in range(3)])
         done = subprocess.run(
