@@ -22,8 +22,7 @@ from api.cli.options import PROCESSOR, AsJson, Device, chosen_device, quick, tak
 from api.settings import Settings
 from templates.distances import Metric
 from verify.evaluation.cluster import cluster as dask_cluster
-from verify.evaluation.embedder import PackEmbedder
-from verify.evaluation.experiment import run_evaluation
+from verify.evaluation.embedding import PackEmbedder
 from verify.evaluation.labels_file import read_labels
 from verify.evaluation.plan import (
     DIMS,
@@ -31,10 +30,10 @@ from verify.evaluation.plan import (
     TARGETS,
     EvaluationError,
     EvaluationPlan,
+    Mode,
     default_strategies,
     units_of,
 )
-from verify.evaluation.units import Mode
 
 LIFTED_MODES = (Mode.POINT, Mode.SUBSPACE)
 
@@ -145,6 +144,10 @@ def evaluate(
     Example: `veilface evaluate lfw.bin --pack buffalo_l --decoys decoys.veil --out lfw-results`
     """
     require_extra("evaluate")
+    # Imported here: they load what the core install lacks.
+    from verify.evaluation.experiment import evaluate as run_evaluation
+    from verify.evaluation.results import document
+
     torch_device = chosen_device(device, here=cluster is None)
     sets = open_all(datasets, pictures=embeddings is None)
     names = None
@@ -174,7 +177,7 @@ def evaluate(
     out.mkdir(parents=True, exist_ok=True)
     local = ThreadPoolExecutor(jobs or default_jobs())
     with local if cluster is None else dask_cluster(cluster) as executor:
-        results = run_evaluation(
+        runs, sets_evaluated = run_evaluation(
             plan,
             embedder,
             sets,
@@ -182,15 +185,23 @@ def evaluate(
             known,
             cache=kept,
             executor=executor,
-            options={
-                "flip": flip,
-                "axes": axes,
-                "cluster": cluster is not None,
-                "labels": named_file(labels),
-            },
             note=lambda sentence: message(f"note: {sentence}"),
             progress=progress,
         )
+    results = document(
+        plan,
+        embedder.model,
+        sources,
+        runs,
+        sets_evaluated,
+        known,
+        options={
+            "flip": flip,
+            "axes": axes,
+            "cluster": cluster is not None,
+            "labels": named_file(labels),
+        },
+    )
     written = write_results(results, out)
     notice = {}
     if isinstance(embedder, PackEmbedder):

@@ -32,9 +32,9 @@ from verify.evaluation.liveness.rates import threshold_at_bpcer
 from verify.evaluation.liveness.scores import ScoredSet, score_set
 from verify.evaluation.liveness.verified import VerifiedSet
 from verify.evaluation.markdown_cells import interval_cell, significant
-from verify.evaluation.results import Model
-from verify.evaluation.rows import Json
-from verify.evaluation.tables import write_lines
+from verify.evaluation.plan import Json
+from verify.evaluation.provenance import Model
+from verify.evaluation.tables import write_csv
 
 
 @takes_settings(*BULK)
@@ -225,7 +225,7 @@ def _write(results: Json, out: Path) -> list[Path]:
     files = [out / "results.json", out / "results.csv", out / "results.md"]
     text = json.dumps(results, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
     replace_public(files[0], text.encode())
-    write_lines(results["rows"], files[1])
+    write_csv(results["rows"], files[1])
     report = markdown(results)
     replace_public(files[2], report.encode())
     figures = write(liveness_figure(results), out, "det")

@@ -13,11 +13,11 @@ from api.settings import Settings
 from models.sessions import default_workers
 from templates.decoys import DecoyGenerator, DecoyPool, load_source
 from templates.decoys.pool import POOL_MAGIC
-from verify.evaluation.embedder import Embedder, FileEmbedder, PackEmbedder
+from verify.evaluation.embedding import Embedder, FileEmbedder, PackEmbedder
 from verify.evaluation.embeddings_file import read_embeddings
+from verify.evaluation.plan import RAW_FLIP
 from verify.evaluation.readers import notes, open_sets
-from verify.evaluation.results import SourceFacts
-from verify.evaluation.units import RAW_FLIP
+from verify.evaluation.sources import SourceFacts
 from verify.evaluation.verification_set import VerificationSet
 
 NO_PACK = "none"

@@ -9,13 +9,13 @@ from rich.table import Table
 from api.cli.console import table
 from api.cli.html_report import write_html
 from templates.keys.private_file import replace_public
-from verify.evaluation.rows import Json
+from verify.evaluation.markdown_cells import MISSING
+from verify.evaluation.plan import Json
 from verify.evaluation.tables import markdown, write_csv
 
 CAPTIONS = {
     "figure": "Accuracy by lifting and dimension, beside that of raw embeddings",
     "det": "False non-matches over false matches (DET)",
-    "roc": "Genuine pairs accepted over false matches (ROC)",
 }
 
 
@@ -27,11 +27,11 @@ def write_results(results: Json, out: Path) -> list[Path]:
     text = json.dumps(results, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
     files = [out / "results.json", out / "results.csv", out / "results.md"]
     # What an earlier run drew of other rows must not stand beside these.
-    for name in ("figure", "det", "roc"):
+    for name in CAPTIONS:
         for suffix in (".png", ".svg"):
             (out / f"{name}{suffix}").unlink(missing_ok=True)
     replace_public(files[0], text.encode())
-    write_csv(results, files[1])
+    write_csv(results["rows"], files[1])
     report = markdown(results)
     replace_public(files[2], report.encode())
     figures = write_figures(results, out)
@@ -66,6 +66,8 @@ def summary(results: Json, dataset: str) -> Table:
 
 
 def _accuracy(row: Json) -> str:
+    if row["accuracy_mean"] is None:
+        return MISSING
     text = f"{100 * row['accuracy_mean']:.2f} ± {100 * row['accuracy_std']:.2f}"
     seeds = row["accuracy_std_seeds"]
     return text if seeds is None else f"{text} ± {100 * seeds:.2f}"

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from templates.decoys.pool import DecoyPool
 from templates.decoys.source import Attributes, DecoySource
 from templates.errors import DecoyError
-from verify.evaluation.acquisition import EmbeddedSet
+from verify.evaluation.embedding import EmbeddedSet
 from verify.evaluation.labels_file import Labels
 from verify.evaluation.plan import EvaluationError
 
@@ -73,16 +73,16 @@ def known_attributes(
         "gender": {label.gender for label in entries if label.gender is not None},
         "race": {label.race for label in entries if label.race is not None},
     }
-    attributes = predict_attributes(faces.acquired.descriptors, pool)
+    attributes = predict_attributes(faces.embeddings, pool)
     predicted = len(attributes)
-    for picture, row in zip(faces.pairs.pictures, faces.acquired.rows.tolist(), strict=True):
-        own = {} if labels is None or row < 0 else labels.find(picture.name)
+    for name, row in zip(faces.pairs.names, faces.rows.tolist(), strict=True):
+        own = {} if labels is None or row < 0 else labels.find(name)
         if not vocabulary.keys() <= own.keys():
             continue
         for attribute, values in vocabulary.items():
             if own[attribute] not in values:
                 raise EvaluationError(
-                    f"the label file says {attribute} {own[attribute]!r} of {picture.name}; "
+                    f"the label file says {attribute} {own[attribute]!r} of {name}; "
                     f"the decoy pool knows {', '.join(sorted(values))}: hybrid+ needs one "
                     "vocabulary for both"
                 )

@@ -12,8 +12,8 @@ from contextlib import contextmanager
 from importlib.metadata import version
 
 from templates.errors import VeilfaceError
+from verify.evaluation.provenance import SOFTWARE
 
-SOFTWARE = "veilface"
 CONNECT_SECONDS = 10
 
 
@@ -68,7 +68,7 @@ def cluster(address: str) -> Iterator[Executor]:
             )
         try:
             with warnings.catch_warnings():
-                # All units share one material, which Dask would have us store on the workers.
+                # All units share one set of pairs, which Dask would have us store on the workers.
                 warnings.filterwarnings("ignore", "Sending large graph", UserWarning)
                 yield client.get_executor(pure=False)  # type: ignore[no-untyped-call]
         except (KilledWorker, CommClosedError, CancelledError):

@@ -1,34 +1,66 @@
-"""The evaluation of a plan on any number of sets: embed, leave test people out, score, report."""
+"""The experiment: embed each set, leave its people out of the decoys, compare all pairs, measure.
 
-from collections.abc import Callable, Sequence
+Every run of every way of comparing is one line of one data frame; the results are read off it.
+"""
+
+from collections.abc import Sequence
 from concurrent.futures import Executor
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
 
 from models.cache import EmbeddingCache
-from templates.decoys import DecoyPool
+from templates.decoys import Attributes
+from templates.distances.blas import single_threaded
+from templates.space.embedding import normalised
 from templates.space.lifting import Strategy
-from verify.evaluation.acquisition import EmbeddedSet
-from verify.evaluation.attributes import known_attributes, resembling
-from verify.evaluation.embedder import Embedder, Progress
-from verify.evaluation.evaluation import Evaluated, evaluate_set, prepare
+from verify.evaluation.attributes import known_attributes
+from verify.evaluation.comparison import Trials, compare
+from verify.evaluation.embedding import Advance, EmbeddedSet, Embedder, Progress
 from verify.evaluation.groups import by_group
+from verify.evaluation.intervals import REPLICATES, OperatingPoints, fmr_grid, replicate_weights
 from verify.evaluation.labels_file import Labels
-from verify.evaluation.material import Material
-from verify.evaluation.plan import EvaluationError, EvaluationPlan, units_of
-from verify.evaluation.results import SetResult, SourceFacts, document
-from verify.evaluation.rows import Json, cell_json, grouped
-from verify.evaluation.timing import timings
-from verify.evaluation.verification_set import VerificationSet
+from verify.evaluation.measures import measure
+from verify.evaluation.plan import (
+    EvaluationError,
+    EvaluationPlan,
+    Json,
+    Mode,
+    Source,
+    Unit,
+    units_of,
+)
+from verify.evaluation.sources import Note, SourceFacts, without_test_people
+from verify.evaluation.verification_set import VerificationSet, require_both_classes
 
-Note = Callable[[str], None]
-SAME_PERSON = 0.4
-"""Cosine from which a decoy counts as a person of the test set. Of 29.6 million pairs of photos of
-two people of LFW 54 reach it, and some of those are one person under two names."""
+CELL = ["dataset", "strategy", "decoys", "shared_decoys", "dim", "mode", "metric"]
+"""What names a way of comparing; curves and groups have these."""
+ROW = [*CELL, "threshold_search"]
+"""What names a row of the results, which is the mean of its runs."""
+ARRAYS = ["similarities", "curve", "replicates"]
+"""Columns of a run that no document has."""
 
 
-def run_evaluation(
+@dataclass(frozen=True, eq=False)
+class SetResult:
+    """One set, the pairs that were compared, and the decoys as they were used on it.
+
+    Parameters
+    ----------
+    predicted
+        Photos whose attributes were predicted; None without hybrid+.
+    """
+
+    faces: EmbeddedSet
+    trials: Trials
+    sources: Sequence[SourceFacts]
+    predicted: int | None
+
+
+def evaluate(
     plan: EvaluationPlan,
     embedder: Embedder,
     sets: Sequence[VerificationSet],
@@ -37,11 +69,22 @@ def run_evaluation(
     *,
     cache: EmbeddingCache | None,
     executor: Executor,
-    options: Json,
     note: Note,
     progress: Progress,
-) -> Json:
-    """Evaluate a plan; return the document of the results.
+) -> tuple[pd.DataFrame, list[SetResult]]:
+    """Evaluate a plan on any number of sets.
+
+    Parameters
+    ----------
+    executor
+        Where units of work are computed: threads, processes or a cluster.
+
+    Returns
+    -------
+    runs
+        As of :func:`run_trials`, of all sets.
+    results
+        What there is to know of each set besides.
 
     Raises
     ------
@@ -51,46 +94,19 @@ def run_evaluation(
     embedded = [
         _embedded(embedder, pairs, cache=cache, note=note, progress=progress) for pairs in sets
     ]
-    results: list[SetResult] = []
-    groups: list[Json] = []
-    summaries: list[Json] = []
-    measured: list[Json] = []
-    predicted: dict[str, int] = {}
-    alike: dict[str, Json] = {}
+    frames, results = [], []
     for faces in embedded:
-        name = faces.pairs.name
-        kept_sources = without_test_people(sources, faces, note=note)
-        decoys = [facts.source for facts in kept_sources]
-        attributes = None
+        own = without_test_people(sources, faces, note=note)
+        decoys = tuple(facts.source for facts in own)
+        attributes, predicted = None, None
         if Strategy.HYBRID_PLUS in plan.strategies:
-            attributes, predicted[name] = known_attributes(faces, labels, decoys)
-        material, facts, kept = prepare(
-            faces.pairs, faces.acquired, attributes=attributes, sources=decoys
-        )
-        units = units_of(plan, decoys, n=material.n)
-        with progress(f"evaluating {name}", len(units)) as advance:
-            evaluated = evaluate_set(
-                material, facts, kept, plan=plan, executor=executor, progress=advance
-            )
-        results.append(SetResult(faces, evaluated, kept_sources))
-        if any(isinstance(source, DecoyPool) for source in decoys):
-            alike[name] = resemblance(material)
-        if labels is not None:
-            entries, whole = group_rows(faces.pairs, evaluated, labels, seed=plan.seed)
-            groups += entries
-            summaries += whole
-        if not measured:
-            measured = timings(material, list(evaluated.source_of.items()))
-    return document(
-        plan,
-        embedder.model,
-        sources,
-        results,
-        options={**options, "predicted_attributes": predicted, "resemblance": alike},
-        timings=measured,
-        groups=groups,
-        group_summaries=summaries,
-    )
+            attributes, predicted = known_attributes(faces, labels, decoys)
+        trials = trials_of(faces, attributes=attributes, sources=decoys)
+        steps = len(units_of(plan, decoys, n=trials.embeddings.shape[1]))
+        with progress(f"evaluating {faces.pairs.name}", steps) as advance:
+            frames.append(run_trials(trials, plan, executor=executor, progress=advance))
+        results.append(SetResult(faces, trials, own, predicted))
+    return pd.concat(frames, ignore_index=True), results
 
 
 def _embedded(
@@ -102,66 +118,165 @@ def _embedded(
     progress: Progress,
 ) -> EmbeddedSet:
     faces = embedder.embed(pairs, cache=cache, progress=progress)
-    failures = faces.acquired.failures
-    if not len(faces.acquired.descriptors):
+    if not len(faces.embeddings):
         raise EvaluationError(
             f"{pairs.name}: no photo gave an embedding, the first because of "
-            f"{failures[0].code}; are these photos of faces, and does what was said of "
+            f"{faces.failures[0].code}; are these photos of faces, and does what was said of "
             "them (aligned, embeddings) fit?"
         )
-    if failures:
+    if faces.failures:
         note(
-            f"{pairs.name}: {len(failures)} of {len(pairs.pictures)} photos skipped; "
+            f"{pairs.name}: {len(faces.failures)} of {len(pairs.pictures)} photos skipped; "
             "the results list them"
         )
-    return faces
+    return faces if pairs.templates is None else averaged(faces, pairs.templates)
 
 
-def without_test_people(
-    sources: Sequence[SourceFacts], faces: EmbeddedSet, *, note: Note
-) -> list[SourceFacts]:
-    """Leave pool entries out that resemble a person of the set.
+def averaged(faces: EmbeddedSet, templates: Sequence[Sequence[int]]) -> EmbeddedSet:
+    """Replace the embeddings of photos by those of templates: the mean of their photos, scaled.
 
-    Whoever was not acquired, or resembles their own photos less than ``SAME_PERSON``, stays in;
-    ``resemblance`` says how many genuine pairs that concerns.
+    Photos that failed are left out of the mean; a template of such photos alone has none.
+    """
+    acquired = [[row for row in faces.rows[list(photos)] if row >= 0] for photos in templates]
+    present = np.array([bool(rows) for rows in acquired])
+
+    def means(embeddings: NDArray[np.float32]) -> NDArray[np.float32]:
+        sums = [embeddings[rows].sum(axis=0, dtype=np.float64) for rows in acquired if rows]
+        return normalised(np.stack(sums)).astype(np.float32)
+
+    return replace(
+        faces,
+        embeddings=means(faces.embeddings),
+        mirrored=None if faces.mirrored is None else means(faces.mirrored),
+        rows=np.where(present, np.cumsum(present) - 1, -1),
+    )
+
+
+def trials_of(
+    faces: EmbeddedSet, *, attributes: Sequence[Attributes] | None, sources: tuple[Source, ...]
+) -> Trials:
+    """Take the pairs of which both photos gave an embedding; the others are counted.
 
     Raises
     ------
-    EvaluationError
-        None is left.
+    DatasetError
+        Too few pairs are left.
     """
-    kept = []
-    for facts in sources:
-        pool = facts.source
-        if not isinstance(pool, DecoyPool):
-            kept.append(facts)
-            continue
-        alike = resembling(pool, faces.acquired.descriptors, cosine=SAME_PERSON)
-        if len(alike) == len(pool):
-            raise EvaluationError(
-                f"every face of {facts.file} resembles one of {faces.pairs.name}; build it from "
-                "other people"
-            )
-        if len(alike):
-            note(
-                f"{faces.pairs.name}: {len(alike)} of {len(pool)} decoys resemble its people "
-                f"(cosine {SAME_PERSON:g} or more) and are left out"
-            )
-            pool = pool.subset(np.setdiff1d(np.arange(len(pool)), alike))
-        kept.append(replace(facts, source=pool, left_out=len(alike)))
-    return kept
+    pairs = faces.pairs
+    first, second = faces.rows[pairs.first], faces.rows[pairs.second]
+    kept = np.flatnonzero((first >= 0) & (second >= 0))
+    same = pairs.same[kept]
+    folds = None if pairs.folds is None else pairs.folds[kept]
+    require_both_classes(
+        f"{pairs.name}, without the {len(pairs) - len(kept)} pairs that lack an embedding,",
+        same,
+        folds,
+    )
+    people = None
+    if pairs.people is not None:
+        numbers = np.unique(np.asarray(pairs.people, dtype=np.str_), return_inverse=True)[1]
+        people = np.stack([numbers[pairs.first[kept]], numbers[pairs.second[kept]]])
+    genuine = int(np.count_nonzero(same))
+    return Trials(
+        name=pairs.name,
+        embeddings=faces.embeddings,
+        mirrored=faces.mirrored,
+        first=first[kept],
+        second=second[kept],
+        same=same,
+        folds=folds,
+        people=people,
+        attributes=attributes,
+        sources=sources,
+        kept=kept,
+        failed_genuine=pairs.genuine - genuine,
+        failed_impostor=pairs.impostor - (len(same) - genuine),
+        fta=len(faces.failures) / len(pairs.pictures),
+    )
 
 
-def resemblance(material: Material) -> Json:
-    """State from which cosine decoys were left out, and which share of genuine pairs is below."""
-    rows = material.descriptors
-    first, second = rows[material.first[material.same]], rows[material.second[material.same]]
-    cosines = np.einsum("ij,ij->i", first, second, dtype=np.float64)
-    return {"cosine": SAME_PERSON, "genuine_below": float(np.mean(cosines < SAME_PERSON))}
+def run_trials(
+    trials: Trials, plan: EvaluationPlan, *, executor: Executor, progress: Advance
+) -> pd.DataFrame:
+    """Compute all units of a plan on one set.
+
+    Parameters
+    ----------
+    progress
+        Called with the number of units done since the last call.
+
+    Returns
+    -------
+    runs
+        One line for each way of comparing, seed, lifted side and threshold search, in the order of
+        the plan and not of arrival. The columns are those of ``ROW``, ``seed`` and ``lifted``,
+        what :func:`measure` returns, and ``similarities`` (P,), ``curve`` (F,), the FNMR at each
+        FMR of ``fmr_grid``, and ``replicates`` (R, targets + F), the FNMR of resampled pairs.
+    """
+    units = units_of(plan, trials.sources, n=trials.embeddings.shape[1])
+    records: list[Json] = []
+    for unit_records in executor.map(partial(run_unit, trials, plan), units):
+        records += unit_records
+        progress(1)
+    modes = list(Mode)
+    records.sort(
+        key=lambda run: (
+            modes.index(run["mode"]),
+            plan.strategies.index(run["strategy"]),
+            run["decoys"] or "",
+            run["dim"],
+            run["metric"],
+            run["threshold_search"] != "grid",
+            run["seed"] or 0,
+            run["lifted"] or "",
+        )
+    )
+    return pd.DataFrame(records, dtype=object)
 
 
-def group_rows(
-    pairs: VerificationSet, evaluated: Evaluated, labels: Labels, *, seed: int
+def run_unit(trials: Trials, plan: EvaluationPlan, unit: Unit) -> list[Json]:
+    """Compute the runs of one unit of work.
+
+    Notes
+    -----
+    Products run on one thread each: workers share a machine, and several threads would round
+    differently.
+    """
+    with single_threaded():
+        searches = ("grid", "exact") if unit.raw and trials.folds is not None else ("exact",)
+        runs: list[Json] = [
+            {
+                "dataset": trials.name,
+                **names,
+                **measure(
+                    similarities, trials.same, trials.folds, targets=plan.targets, search=search
+                ),
+                "similarities": similarities,
+            }
+            for names, similarities in compare(trials, unit, plan)
+            for search in searches
+        ]
+        _add_curves(trials, runs)
+    return runs
+
+
+def _add_curves(trials: Trials, runs: Sequence[Json]) -> None:
+    """Add curves and replicates: the same draws of people for all runs."""
+    same, grid = trials.same, fmr_grid(trials.impostor)
+    points, wanted = [], []
+    for run in runs:
+        similarities = run["similarities"]
+        points.append(OperatingPoints(similarities[same], similarities[~same]))
+        wanted.append(np.concatenate([[*map(float, run["fnmr_at_fmr"])], grid]))
+        run["curve"] = points[-1].fnmr(grid)
+        run["replicates"] = np.empty((REPLICATES, len(wanted[-1])), dtype=np.float32)
+    for row, (genuine, impostor) in enumerate(replicate_weights(trials, seed=0)):
+        for run, run_points, fmrs in zip(runs, points, wanted, strict=True):
+            run["replicates"][row] = run_points.fnmr(fmrs, genuine=genuine, impostor=impostor)
+
+
+def group_rates(
+    runs: pd.DataFrame, results: Sequence[SetResult], labels: Labels, plan: EvaluationPlan
 ) -> tuple[list[Json], list[Json]]:
     """Count errors by group at the threshold that holds for all, in every row and target.
 
@@ -170,27 +285,28 @@ def group_rows(
     groups, summaries
         Entries for each group, and one for all groups of an attribute together.
     """
-    names = [picture.name for picture in pairs.pictures]
     groups: list[Json] = []
     summaries: list[Json] = []
-    for attribute in labels.attributes:
-        column = labels.column(attribute, names)
-        first = [column[place] for place in pairs.first[evaluated.kept].tolist()]
-        second = [column[place] for place in pairs.second[evaluated.kept].tolist()]
-        for (cell, search), runs in grouped(evaluated.runs).items():
-            if search != "exact":
-                continue
-            head = {"dataset": pairs.name, **cell_json(cell), "seed": seed}
-            for place, errors in enumerate(runs[0].measures.at):
-                report = by_group(
-                    [run.similarities for run in runs],
-                    evaluated.material.same,
-                    first,
-                    second,
-                    attribute=attribute,
-                    thresholds=[run.measures.at[place].threshold for run in runs],
-                    target_fmr=errors.target,
-                )
-                groups += [{**head, **entry} for entry in report.json()]
-                summaries.append({**head, **report.summary()})
+    exact = runs[runs["threshold_search"] == "exact"]
+    for result in results:
+        pairs, trials = result.faces.pairs, result.trials
+        own = exact[exact["dataset"] == pairs.name]
+        for attribute in labels.attributes:
+            column = labels.column(attribute, pairs.names)
+            first = [column[place] for place in pairs.first[trials.kept].tolist()]
+            second = [column[place] for place in pairs.second[trials.kept].tolist()]
+            for _, lines in own.groupby(CELL, sort=False, dropna=False):
+                head = {**lines.iloc[0][CELL].to_dict(), "seed": plan.seed}
+                for target in lines["fnmr_at_fmr"].iloc[0]:
+                    entries, summary = by_group(
+                        list(lines["similarities"]),
+                        trials.same,
+                        first,
+                        second,
+                        attribute=attribute,
+                        thresholds=[at[target]["threshold"] for at in lines["fnmr_at_fmr"]],
+                        target_fmr=float(target),
+                    )
+                    groups += [{**head, **entry} for entry in entries]
+                    summaries.append({**head, **summary})
     return groups, summaries

@@ -2,23 +2,39 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
 
 from templates.contract.binding import MAX_M
-from templates.decoys import DecoyPool
+from templates.decoys import DecoyGenerator, DecoyPool
 from templates.distances import DEFAULT_STEPS, Metric
 from templates.errors import VeilfaceError
 from templates.space.lifting import Strategy
-from verify.evaluation.material import Source
-from verify.evaluation.units import RAW, RAW_FLIP, LiftUnit, Mode, RawUnit, Unit
 
+Json = dict[str, Any]
+Source = DecoyPool | DecoyGenerator
+
+RAW = "raw"
+RAW_FLIP = "raw+flip"
 STRATEGIES = (RAW, RAW_FLIP, *(strategy.value for strategy in Strategy))
-WITHOUT_DECOYS = (
-    RAW,
-    RAW_FLIP,
-    *(strategy.value for strategy in Strategy if not strategy.needs_decoys),
-)
 DIMS = (2, 4, 8, 16)
 TARGETS = (1e-2, 1e-3, 1e-4)
+
+
+def decoy_kind(source: Source) -> str:
+    """Name the kind of a source, as rows do."""
+    return "pool" if isinstance(source, DecoyPool) else "generator"
+
+
+class Mode(StrEnum):
+    """Which sides of a comparison are lifted."""
+
+    RAW = "p2p"
+    """Neither: point to point."""
+    POINT = "p2s"
+    """One: point to subspace."""
+    SUBSPACE = "s2s"
+    """Both: subspace to subspace."""
 
 
 class EvaluationError(VeilfaceError):
@@ -36,9 +52,11 @@ class EvaluationPlan:
     modes, metrics
         Of lifted comparisons.
     shared_decoys
-        Whether both sides of subspace-to-subspace comparisons draw from the whole pool.
+        Whether both sides draw from the whole pool, instead of each from its own half.
     repeats, seed
         Everything random is repeated with the seeds ``seed … seed + repeats − 1``.
+    steps
+        Of the spherical iteration.
     device
         Of torch, for subspace-to-subspace distances; None for the processor.
 
@@ -81,9 +99,35 @@ class EvaluationPlan:
             raise EvaluationError("at least one repeat is needed")
 
 
+@dataclass(frozen=True)
+class Unit:
+    """One lifting of both sides of all pairs, compared in every mode and metric of the plan.
+
+    Parameters
+    ----------
+    strategy
+        Of ``STRATEGIES``; raw embeddings are not lifted, and have neither ``m`` nor a seed.
+    m
+        Dimension of the subspaces; 0 for raw embeddings.
+    source
+        Position of the decoy source among those of the evaluation; None without decoys.
+    """
+
+    strategy: str
+    m: int = 0
+    source: int | None = None
+    seed: int | None = None
+
+    @property
+    def raw(self) -> bool:
+        """Whether embeddings are compared as they are."""
+        return self.strategy in (RAW, RAW_FLIP)
+
+
 def default_strategies(sources: Sequence[Source], *, raw_flip: bool) -> tuple[str, ...]:
     """All strategies that the decoys allow but the sub- ones."""
-    able = set(WITHOUT_DECOYS) - (set() if raw_flip else {RAW_FLIP})
+    able = {RAW, RAW_FLIP if raw_flip else RAW}
+    able |= {strategy.value for strategy in Strategy if not strategy.needs_decoys}
     if sources:
         able |= {Strategy.ADVERSARIAL, Strategy.HYBRID}
     if any(isinstance(source, DecoyPool) and source.labelled for source in sources):
@@ -99,35 +143,24 @@ def units_of(plan: EvaluationPlan, sources: Sequence[Source], *, n: int) -> list
     EvaluationError
         A strategy lacks the decoys that it needs, or a dimension does not fit.
     """
-    seeds = range(plan.seed, plan.seed + plan.repeats)
     units: list[Unit] = []
     for name in plan.strategies:
         if name in (RAW, RAW_FLIP):
-            units.append(RawUnit(flip=name == RAW_FLIP))
-        else:
-            strategy = Strategy(name)
-            _check_dims(strategy, plan.dims, n)
-            places = _fitting(strategy, sources, plan)
-            for place in places:
-                _check_dims(strategy, plan.dims, n if place is None else sources[place].k)
+            units.append(Unit(name))
+            continue
+        strategy = Strategy(name)
+        _check_dims(strategy, plan.dims, n)
+        for place in _fitting(strategy, sources):
+            if place is not None:
+                _check_dims(strategy, plan.dims, sources[place].k)
+                _check_size(strategy, sources[place], plan)
             units += [
-                LiftUnit(
-                    strategy=strategy,
-                    m=m,
-                    source=source,
-                    shared=plan.shared_decoys,
-                    modes=plan.modes,
-                    metrics=plan.metrics,
-                    steps=plan.steps,
-                    device=plan.device,
-                    seed=seed,
-                )
-                for source in places
+                Unit(name, m, place, seed)
                 for m in plan.dims
-                for seed in seeds
+                for seed in range(plan.seed, plan.seed + plan.repeats)
             ]
-    # A long unit that starts last would leave the other processes idle.
-    return sorted(units, key=lambda unit: -unit.m if isinstance(unit, LiftUnit) else 0)
+    # A long unit that starts last would leave the other workers idle.
+    return sorted(units, key=lambda unit: -unit.m)
 
 
 def _check_dims(strategy: Strategy, dims: Sequence[int], n: int) -> None:
@@ -141,37 +174,25 @@ def _check_dims(strategy: Strategy, dims: Sequence[int], n: int) -> None:
         )
 
 
-def _fitting(
-    strategy: Strategy, sources: Sequence[Source], plan: EvaluationPlan
-) -> list[int | None]:
+def _fitting(strategy: Strategy, sources: Sequence[Source]) -> list[int | None]:
     """Positions of the sources that the strategy can draw from."""
     if not strategy.needs_decoys:
         return [None]
-    pools_only = strategy is Strategy.HYBRID_PLUS or strategy.sub_databases is not None
-    places: list[int | None] = [
-        place
-        for place, source in enumerate(sources)
-        if (
-            isinstance(source, DecoyPool)
-            and (source.labelled or strategy is not Strategy.HYBRID_PLUS)
-        )
-        or not (pools_only or isinstance(source, DecoyPool))
-    ]
+    labelled = strategy is Strategy.HYBRID_PLUS
+    pools_only = labelled or strategy.sub_databases is not None
+    places: list[int | None] = []
+    for place, source in enumerate(sources):
+        if isinstance(source, DecoyPool):
+            if source.labelled or not labelled:
+                places.append(place)
+        elif not pools_only:
+            places.append(place)
     if not places:
-        what = (
-            "a pool with gender and race labels"
-            if strategy is Strategy.HYBRID_PLUS
-            else "a pool"
-            if pools_only
-            else "decoys"
-        )
+        what = "a pool" if pools_only else "decoys"
         raise EvaluationError(
-            f"{strategy} lifting needs {what}: make one with `veilface decoys build`, or "
-            "leave the strategy out"
+            f"{strategy} lifting needs {what}{' with gender and race labels' if labelled else ''}: "
+            "make one with `veilface decoys build`, or leave the strategy out"
         )
-    for place in places:
-        if place is not None:
-            _check_size(strategy, sources[place], plan)
     return places
 
 

@@ -1,4 +1,4 @@
-"""How a row of `results.json` is named, ordered and joined with its timing."""
+"""How a row of `results.json` is named and ordered."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -67,16 +67,6 @@ def preferred_metric(rows: Iterable[Row]) -> str | None:
     """Return the metric to show where only one can be: spherical, as the product decides."""
     present = {str(row["metric"]) for row in rows}
     return next((metric for metric in PREFERRED_METRICS if metric in present), None)
-
-
-def timings_by_key(results: Row) -> dict[tuple[Any, ...], Row]:
-    """Return the timing of each (strategy, decoys, dim, mode, metric)."""
-    return {timing_key(timing): timing for timing in results.get("timings", ())}
-
-
-def timing_key(row: Row) -> tuple[Any, ...]:
-    """Return what a row and its timing have in common."""
-    return tuple(row[name] for name in ("strategy", "decoys", "dim", "mode", "metric"))
 
 
 def fmr_targets(rows: Iterable[Row]) -> list[str]:

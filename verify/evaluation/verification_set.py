@@ -1,10 +1,8 @@
-"""A benchmark of pairs, whatever file or folder it was read from."""
+"""Pairs of photos to verify, in the order of their protocol, whatever it was read from."""
 
 import hashlib
-from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,37 +16,16 @@ Indices = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
 
-class Picture(Protocol):
-    """A photo of a set that can be read, once or more."""
-
-    @property
-    def name(self) -> str:
-        """Path of the photo relative to its set, or its place in the file; unique in the set."""
-        ...
-
-    @property
-    def source(self) -> Path | EncodedImage | MarkedPhoto:
-        """The photo as bulk extraction takes it; a file is not read yet."""
-        ...
-
-    @property
-    def keypoints(self) -> NDArray[np.float64] | None:
-        """Five points of the face that the set offers, (5, 2); None where it offers none."""
-        ...
-
-    def read(self) -> bytes:
-        """Return the encoded photo; of one that is too large, enough to tell."""
-        ...
-
-
 @dataclass(frozen=True)
 class PictureFile:
     """A photo in a folder.
 
     Parameters
     ----------
+    name
+        Path relative to the set; unique in it.
     keypoints : (5, 2) float64, optional
-        What the set offers, for packs without a detector.
+        Points of the face that the set offers, for packs without a detector.
     """
 
     name: str
@@ -57,7 +34,7 @@ class PictureFile:
 
     @property
     def source(self) -> Path | MarkedPhoto:
-        """The file, with its points where it has them."""
+        """The photo as bulk extraction takes it; the file is not read yet."""
         return self.path if self.keypoints is None else MarkedPhoto(self.path, self.keypoints)
 
     def read(self) -> bytes:
@@ -68,29 +45,28 @@ class PictureFile:
 
 @dataclass(frozen=True)
 class PictureBytes:
-    """A photo inside a larger file."""
+    """A photo inside a larger file, where it is an aligned crop; named by its place in it."""
 
     name: str
     data: bytes = field(repr=False)
+    keypoints: None = None
 
     @property
     def source(self) -> EncodedImage:
         """The bytes under the photo's name."""
         return EncodedImage(self.name, self.data)
 
-    @property
-    def keypoints(self) -> None:
-        """None: it is an aligned crop."""
-        return
-
     def read(self) -> bytes:
         """Return the bytes."""
         return self.data
 
 
+Picture = PictureFile | PictureBytes
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class VerificationSet:
-    """Pairs of photos, in the order and the folds of their protocol.
+    """Pairs of photos, or of templates of several photos each, as their protocol has them.
 
     Parameters
     ----------
@@ -101,17 +77,21 @@ class VerificationSet:
     pictures
         The photos that pairs use, each once, in the order of their first use.
     first, second : (P,) int64
-        Positions in ``pictures``.
+        Positions in ``pictures``, or in ``templates`` where there are such.
     same : (P,) bool
         Whether a pair shows one person.
-    folds : (P,) int64
-        0 … 9.
+    folds : (P,) int64, optional
+        0 … 9; None where the protocol has none, and so no accuracy.
     people
-        Name of the person on each of ``pictures``, or None where the set does not tell.
+        Name of the person on each of ``pictures`` (of ``templates``), or None where the set does
+        not tell.
     protocol_files
         Names and SHA-256 of the files that define the pairs, such as ``pairs.txt``.
     aligned
         True where the format promises aligned crops (``.bin``), else None: not known.
+    templates
+        Positions of the photos of each template, in protocols that compare the mean embedding of
+        several, as IJB-C does; None where photos are compared.
     """
 
     name: str
@@ -120,10 +100,11 @@ class VerificationSet:
     first: Indices
     second: Indices
     same: Flags
-    folds: Indices
+    folds: Indices | None
     people: tuple[str, ...] | None = None
     protocol_files: tuple[tuple[str, str], ...] = ()
     aligned: bool | None = None
+    templates: tuple[tuple[int, ...], ...] | None = None
 
     def __len__(self) -> int:
         return len(self.same)
@@ -141,6 +122,13 @@ class VerificationSet:
         """Number of pairs that show two people."""
         return len(self) - self.genuine
 
+    @property
+    def names(self) -> list[str]:
+        """Name of each photo; of a template that of its first photo."""
+        if self.templates is None:
+            return [picture.name for picture in self.pictures]
+        return [self.pictures[template[0]].name for template in self.templates]
+
 
 def contiguous_folds(pairs: int) -> Indices:
     """Split ``pairs`` into ten runs in file order, the first ones longer by one where needed.
@@ -152,14 +140,19 @@ def contiguous_folds(pairs: int) -> Indices:
     ).astype(np.int64)
 
 
-def require_both_classes(name: str, same: Flags, folds: Indices) -> None:
-    """Check that every fold has pairs of one person and pairs of two.
+def require_both_classes(name: str, same: Flags, folds: Indices | None) -> None:
+    """Check that there are pairs of one person and pairs of two, in every fold if there are folds.
 
     Raises
     ------
     DatasetError
         Naming the folds that lack either: most often the pairs are sorted by class, or cut off.
     """
+    if folds is None:
+        if same.all() or not same.any():
+            people = "two people" if same.any() else "one person"
+            raise DatasetError(f"{name} has no pair of {people}: error rates need both kinds")
+        return
     faults = []
     for fold in range(FOLDS):
         inside = same[folds == fold]
@@ -173,12 +166,6 @@ def require_both_classes(name: str, same: Flags, folds: Indices) -> None:
             f"{name} is not in the order of a ten-fold protocol: {'; '.join(faults)}. Give the "
             "pairs fold by fold, both kinds in each"
         )
-
-
-def unequal_folds(same: Flags, folds: Indices) -> bool:
-    """Whether folds differ in their numbers of genuine or impostor pairs."""
-    counts = Counter(zip(folds.tolist(), same.tolist(), strict=True))
-    return len(set(counts.values())) > 1
 
 
 def digest_of(data: bytes) -> str:

@@ -10,7 +10,7 @@ from distributed import LocalCluster
 
 from tests.api.cli.conftest import run
 from tests.api.cli.evaluation_bench import secrets
-from verify.evaluation import evaluation
+from verify.evaluation import experiment
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def refused(*given: Any, **named: Any) -> Any:
 def test_a_cluster_gives_the_same_bits(bench, results, cluster, tmp_path, monkeypatch):
     before = {process.pid for process in psutil.Process().children(recursive=True)}
     # Workers are processes of their own: this one compares nothing.
-    monkeypatch.setattr(evaluation, "run_unit", refused)
+    monkeypatch.setattr(experiment, "run_unit", refused)
     out = tmp_path / "out"
     ran = run(*bench.full, "--cluster", cluster.scheduler_address, "--out", out, "--json")
     assert ran.status == 0, ran.stderr

@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from api.cli import evaluate
 from models.pack import ModelPack
 from tests.api.cli.conftest import run
+from verify.evaluation import experiment
 
 USAGE: list[tuple[list[str], str]] = [
     (["--strategy", "homomorphic"], "choose of raw, raw+flip, random"),
@@ -59,7 +59,7 @@ FAILED: list[tuple[list[str], str]] = [
 def test_what_cannot_be_done_is_said_before_any_face_is_embedded(
     bench, tmp_path, monkeypatch, arguments, reason, status
 ):
-    monkeypatch.setattr(evaluate, "run_evaluation", None)
+    monkeypatch.setattr(experiment, "evaluate", None)
     for name in ("embed", "embed_both"):
         monkeypatch.setattr(ModelPack, name, None)
     rows = np.eye(32, dtype=np.float32)

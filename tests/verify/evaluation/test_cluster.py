@@ -11,13 +11,12 @@ import numpy as np
 import pytest
 from distributed import LocalCluster, get_worker
 
-from tests.verify.evaluation.materials import material
+from tests.verify.evaluation.made_trials import made_trials
 from verify.evaluation import cluster as module
 from verify.evaluation.cluster import ClusterError, cluster
-from verify.evaluation.evaluation import evaluate_set
-from verify.evaluation.material import Material
+from verify.evaluation.comparison import Trials
+from verify.evaluation.experiment import ARRAYS, run_trials
 from verify.evaluation.plan import EvaluationPlan
-from verify.evaluation.rows import SetFacts
 
 
 @pytest.fixture(scope="module")
@@ -32,15 +31,15 @@ def address() -> Iterator[str]:
         yield running.scheduler_address
 
 
-def kept_embeddings(known: Material, _: int) -> tuple[int, bool]:
+def kept_embeddings(known: Trials, _: int) -> tuple[int, bool]:
     """Process of a worker, and whether what it may spill has the embeddings of its task."""
     values = get_worker().data.values()  # type: ignore[no-untyped-call]
-    return os.getpid(), any(known.descriptors.tobytes() in dask_bytes(value) for value in values)
+    return os.getpid(), any(known.embeddings.tobytes() in dask_bytes(value) for value in values)
 
 
 def dask_bytes(value: object) -> bytes:
-    descriptors = getattr(value, "descriptors", None)
-    return b"" if descriptors is None else descriptors.tobytes()
+    embeddings = getattr(value, "embeddings", None)
+    return b"" if embeddings is None else embeddings.tobytes()
 
 
 def die(_: int) -> None:
@@ -49,31 +48,21 @@ def die(_: int) -> None:
 
 def test_a_cluster_gives_the_same_runs(address: str) -> None:
     plan = EvaluationPlan(("raw", "adversarial"), dims=(2, 3), repeats=2, targets=(0.1,))
-    facts = SetFacts("made", 50, 50, 0, 0, 0.0, names_people=True)
     done: list[int] = []
     found = []
     for workers in (ThreadPoolExecutor(1), ThreadPoolExecutor(3), cluster(address)):
         with workers as executor:
-            evaluated = evaluate_set(
-                material(),
-                facts,
-                np.arange(100),
-                plan=plan,
-                executor=executor,
-                progress=done.append,
-            )
-        found.append(evaluated.runs)
+            found.append(run_trials(made_trials(), plan, executor=executor, progress=done.append))
     assert sum(done) == 3 * (1 + 2 * 2)
     for runs in found[1:]:
-        for run, wanted in zip(runs, found[0], strict=True):
-            assert (run.cell, run.seed, run.measures) == (wanted.cell, wanted.seed, wanted.measures)
-            np.testing.assert_array_equal(run.similarities, wanted.similarities)
-            np.testing.assert_array_equal(run.replicates, wanted.replicates)
+        assert runs.drop(columns=ARRAYS).equals(found[0].drop(columns=ARRAYS))
+        for name in ARRAYS:
+            np.testing.assert_array_equal(np.stack(runs[name]), np.stack(found[0][name]))
 
 
 def test_a_worker_has_no_embedding_where_it_may_write_to_disk(address: str) -> None:
     with cluster(address) as executor:
-        seen = list(executor.map(partial(kept_embeddings, material()), range(8)))
+        seen = list(executor.map(partial(kept_embeddings, made_trials()), range(8)))
     assert os.getpid() not in {process for process, _ in seen}
     assert not any(kept for _, kept in seen)
 

@@ -1,86 +1,77 @@
-"""The intervals of rows and the bands of curves, against replicates that are written out."""
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from templates.distances import Metric
-from templates.space.lifting import Strategy
-from tests.verify.evaluation.materials import material
-from verify.evaluation.material import Material
-from verify.evaluation.resampling import fmr_grid, replicate_weights
-from verify.evaluation.rows import SetFacts, curve_json, grouped, row_json
-from verify.evaluation.runs import Run, run_unit
-from verify.evaluation.units import LiftUnit, Mode
-from verify.metrics import threshold_at_fmr, wilson
-
-TARGET = 0.05
+from tests.verify.evaluation.made_trials import made_trials
+from verify.evaluation.intervals import OperatingPoints, fmr_grid, replicate_weights
+from verify.metrics import false_non_match_rate, threshold_at_fmr
 
 
-def runs_of(known: Material, seeds: range) -> list[Run]:
-    """Runs of one cell whose lifts differ much, so that the draw of runs shows."""
-    units = [
-        LiftUnit(Strategy.ADVERSARIAL, 2, 0, True, (Mode.SUBSPACE,), (Metric.EUCLIDEAN,), 9, seed)
-        for seed in seeds
-    ]
-    runs = [run for unit in units for run in run_unit(known, unit, targets=(TARGET,))]
-    (found,) = grouped(runs).values()
-    return found
+def test_replicates_weigh_people_as_often_as_they_are_drawn() -> None:
+    known = made_trials(people=20, pairs=60)
+    drawn = list(replicate_weights(known, seed=1, replicates=200))
+    people = known.people
+    assert people is not None
+    person = people[0, known.same]
+    one, two = people[:, ~known.same]
+    for genuine, impostor in drawn:
+        # All genuine pairs of one person weigh the same: how often the person was drawn.
+        times = {p: genuine[person == p] for p in np.unique(person)}
+        assert all((weights == weights[0]).all() for weights in times.values())
+        both = [k for k in range(len(one)) if one[k] in times and two[k] in times]
+        expected = [times[one[k]][0] * times[two[k]][0] for k in both]
+        np.testing.assert_array_equal(impostor[both], expected)
+    assert np.mean([genuine.mean() for genuine, _ in drawn]) == pytest.approx(1, abs=0.1)
 
 
-def written_out(known: Material, runs: list[Run], fmr: float) -> tuple[float, float]:
-    """95 % interval of the mean FNMR: trials repeated as often as they were drawn, run by run."""
-    every = []
-    for genuine, impostor in replicate_weights(known, seed=0):
-        rates = []
-        for run in runs:
-            mated, other = run.similarities[known.same], run.similarities[~known.same]
-            repeated = np.repeat(other, impostor.astype(int))
-            threshold = threshold_at_fmr(repeated, fmr)
-            rates.append(np.mean(np.repeat(mated, genuine.astype(int)) < threshold))
-        every.append(rates)
-    rates = np.array(every)
-    chosen = np.random.default_rng(99).integers(len(runs), size=(20, *rates.shape))
-    means = [np.take_along_axis(rates, draw, axis=1).mean(axis=1) for draw in chosen]
-    low, high = np.percentile(np.concatenate(means), [2.5, 97.5])
-    return float(low), float(high)
+def test_pairs_are_drawn_where_people_have_no_names() -> None:
+    nameless = made_trials(people=20, pairs=60, named=False)
+    for genuine, impostor in replicate_weights(nameless, seed=1, replicates=50):
+        assert genuine.sum() + impostor.sum() == len(nameless)
+        assert genuine.any()
+        assert impostor.any()
 
 
-@pytest.mark.parametrize("named", [True, False])
-def test_intervals_are_those_of_replicates_written_out(named: bool) -> None:
-    known = material(people=40, pairs=400, spread=0.15, named=named)
-    runs = runs_of(known, range(4))
-    facts = SetFacts("made", 200, 200, 0, 0, 0.0, names_people=named)
-    row = row_json(runs[0].cell, "exact", runs, facts, seed=0, n=24, source=None, contract_id=None)
-    at = row["fnmr_at_fmr"]["0.05"]
-    low, high = written_out(known, runs, TARGET)
-    # Its own threshold in every replicate makes it much wider than the errors alone would.
-    bounds = wilson(at["errors_mean"], 200)
-    assert high - low > 1.5 * (bounds[1] - bounds[0])
-    assert at["ci_low"] == pytest.approx(low, abs=0.05)
-    assert at["ci_high"] == pytest.approx(high, abs=0.05)
-    assert at["interval"] == ("subject-bootstrap" if named else "pair-bootstrap")
+def test_one_seed_gives_one_sequence_of_draws() -> None:
+    known = made_trials()
+    once, again = (list(replicate_weights(known, seed=3, replicates=5)) for _ in range(2))
+    for left, right in zip(once, again, strict=True):
+        np.testing.assert_array_equal(left[0], right[0])
+        np.testing.assert_array_equal(left[1], right[1])
 
 
-def test_the_band_of_a_curve_is_that_of_replicates_written_out() -> None:
-    known = material(people=40, pairs=400, spread=0.15)
-    runs = runs_of(known, range(4))
-    facts = SetFacts("made", 200, 200, 0, 0, 0.0, names_people=True)
-    curve = curve_json(runs[0].cell, runs, facts)
-    grid = fmr_grid(200)
-    np.testing.assert_allclose(curve["fmr"], grid)
-    for place in (10, 25, 40):
-        low, high = written_out(known, runs, grid[place])
-        assert curve["low"][place] == pytest.approx(low, abs=0.05)
-        assert curve["high"][place] == pytest.approx(high, abs=0.05)
+@pytest.mark.parametrize("decimals", [1, 3])
+def test_unweighted_points_are_those_of_the_metrics(decimals: int) -> None:
+    generator = np.random.default_rng(decimals)
+    mated = np.round(generator.normal(0.6, 0.2, 300), decimals)
+    other = np.round(generator.normal(0, 0.2, 400), decimals)
+    fmrs = np.array([3 / 400, 0.01, 0.1, 0.5])
+    expected = [false_non_match_rate(mated, threshold_at_fmr(other, fmr)).value for fmr in fmrs]
+    np.testing.assert_allclose(OperatingPoints(mated, other).fnmr(fmrs), expected, atol=1e-12)
 
 
-def test_one_run_has_the_spread_of_people_only(tmp_path: Path) -> None:
-    known = material(people=40, pairs=400, spread=0.15)
-    (run,) = runs_of(known, range(1))
-    facts = SetFacts("made", 200, 200, 0, 0, 0.0, names_people=True)
-    curve = curve_json(run.cell, [run], facts)
-    low, high = np.percentile(run.replicates[:, 1:], [2.5, 97.5], axis=0)
-    np.testing.assert_allclose(curve["low"], low, atol=1e-6)
-    np.testing.assert_allclose(curve["high"], high, atol=1e-6)
+def test_weights_stand_for_trials_that_are_repeated() -> None:
+    generator = np.random.default_rng(5)
+    mated, other = generator.normal(0.6, 0.3, 50), generator.normal(0, 0.3, 80)
+    points = OperatingPoints(mated, other)
+    fmrs = np.array([0.05, 0.2, 1.0])
+    for _ in range(6):
+        genuine, impostor = generator.integers(0, 3, 50), generator.integers(0, 3, 80)
+        found = points.fnmr(fmrs, genuine=genuine.astype(float), impostor=impostor.astype(float))
+        ranked = np.sort(np.repeat(other, impostor))[::-1]
+        repeated = np.repeat(mated, genuine)
+        for place, fmr in enumerate(fmrs):
+            allowed = int(np.floor(fmr * len(ranked) + 1e-9))
+            least = ranked[allowed] if allowed < len(ranked) else -np.inf
+            # The cut lies above the first that is rejected, and accepts all above that one.
+            above = ranked[ranked > least]
+            most = above.min() if above.size else np.inf
+            low = np.count_nonzero(repeated <= least) / len(repeated)
+            high = np.count_nonzero(repeated < most) / len(repeated)
+            assert low - 1e-9 <= found[place] <= high + 1e-9
+
+
+def test_the_grid_begins_where_the_data_can_speak() -> None:
+    grid = fmr_grid(3000)
+    assert grid[0] == pytest.approx(1e-3)
+    assert grid[-1] == 1
+    assert fmr_grid(2)[0] == 1

@@ -50,28 +50,37 @@ def test_figures_equal_those_of_independent_code(seed: int) -> None:
     similarities, same = scores_of(200, seed)
     similarities = np.round(similarities, 1)  # ties
     found = measure(similarities, same, contiguous_folds(200), targets=(0.5, 0.05, 1e-3))
-    assert found.auc == pytest.approx(roc_auc_score(same, similarities))
+    assert found["auc"] == pytest.approx(roc_auc_score(same, similarities))
     mated, other = similarities[same], similarities[~same]
     spread = np.sqrt((np.var(mated) + np.var(other)) / 2)
-    assert found.d_prime == pytest.approx((mated.mean() - other.mean()) / spread)
-    assert [errors.target for errors in found.at] == [0.5, 0.05]
-    for errors in found.at:
-        assert errors.fmr_errors == np.count_nonzero(other >= errors.threshold)
-        assert errors.errors == np.count_nonzero(mated < errors.threshold)
-        assert errors.fmr_errors / errors.fmr_trials <= errors.target
+    assert found["d_prime"] == pytest.approx((mated.mean() - other.mean()) / spread)
+    assert list(found["fnmr_at_fmr"]) == ["0.5", "0.05"]
+    for target, at in found["fnmr_at_fmr"].items():
+        assert at["fmr_errors"] == np.count_nonzero(other >= at["threshold"])
+        assert at["errors"] == np.count_nonzero(mated < at["threshold"])
+        assert at["fmr_errors"] / at["fmr_trials"] <= float(target)
         # No lower threshold keeps the target.
-        lower = other[other < errors.threshold].max()
-        assert np.count_nonzero(other >= lower) / other.size > errors.target
+        lower = other[other < at["threshold"]].max()
+        assert np.count_nonzero(other >= lower) / other.size > float(target)
+
+
+def test_without_folds_there_are_error_rates_and_no_accuracy() -> None:
+    similarities, same = scores_of(200, 1)
+    found = measure(similarities, same, None, targets=(0.05,))
+    folded = measure(similarities, same, contiguous_folds(200), targets=(0.05,))
+    assert (found["accuracies"], found["thresholds"]) == (None, None)
+    assert found["fnmr_at_fmr"] == folded["fnmr_at_fmr"]
+    assert found["eer"] == folded["eer"]
 
 
 def test_pairs_that_meet_are_collisions() -> None:
     similarities = np.array([1.0, 1 - 1e-6**2, 1 - 1e-2, 0.0] * 10)
     same = np.array([False, False, False, True] * 10)
     found = measure(similarities, same, contiguous_folds(40), targets=())
-    assert found.collisions == 20
+    assert found["collisions"] == 20
 
 
 def test_separation_without_spread() -> None:
-    assert d_prime(np.ones(3), np.zeros(3)) == np.inf
-    assert d_prime(np.zeros(3), np.ones(3)) == -np.inf
+    # JSON has no infinity.
+    assert d_prime(np.ones(3), np.zeros(3)) is None
     assert d_prime(np.ones(3), np.ones(3)) == 0

@@ -1,19 +1,17 @@
 import pytest
 
-from templates.space.lifting import Strategy
-from tests.verify.evaluation.materials import pool
+from tests.verify.evaluation.made_trials import pool
 from verify.evaluation.plan import EvaluationError, EvaluationPlan, units_of
-from verify.evaluation.units import LiftUnit, RawUnit
 
 
 def test_the_paper_s_table_is_five_seeds_of_every_cell() -> None:
     plan = EvaluationPlan(("raw", "random", "adversarial", "hybrid"), dims=(2, 4), seed=10)
     units = units_of(plan, [pool()], n=24)
-    lifted = [unit for unit in units if isinstance(unit, LiftUnit)]
+    lifted = [unit for unit in units if not unit.raw]
     assert len(lifted) == 3 * 2 * 5
     assert {unit.seed for unit in lifted} == {10, 11, 12, 13, 14}
-    assert {unit.source for unit in lifted if unit.strategy is Strategy.RANDOM} == {None}
-    assert sum(isinstance(unit, RawUnit) for unit in units) == 1
+    assert {unit.source for unit in lifted if unit.strategy == "random"} == {None}
+    assert [unit.strategy for unit in units if unit.raw] == ["raw"]
     # Long units come first.
     dims = [unit.m for unit in lifted]
     assert dims == sorted(dims, reverse=True)

@@ -5,14 +5,14 @@ from pathlib import Path
 from typing import Any
 
 from verify.evaluation.figures.bars import verification_figure
-from verify.evaluation.figures.curves import det_figure, roc_figure
+from verify.evaluation.figures.curves import det_figure
 from verify.evaluation.figures.style import write
 
-__all__ = ["det_figure", "roc_figure", "verification_figure", "write_figures"]
+__all__ = ["det_figure", "verification_figure", "write_figures"]
 
 
 def write_figures(results: Mapping[str, Any], folder: Path | str) -> list[Path]:
-    """Write ``figure``, ``det`` and ``roc``, each as PNG and SVG.
+    """Write ``figure`` and ``det``, each as PNG and SVG.
 
     Parameters
     ----------
@@ -26,7 +26,6 @@ def write_figures(results: Mapping[str, Any], folder: Path | str) -> list[Path]:
     figures = {
         "figure": verification_figure(results),
         "det": det_figure(results),
-        "roc": roc_figure(results),
     }
     return [
         path

@@ -1,6 +1,6 @@
-"""DET and ROC: what each false match rate costs, with the band of its uncertainty."""
+"""The DET: what each false match rate costs, with the band of its uncertainty."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -8,7 +8,6 @@ import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, NullFormatter
 from scipy.special import ndtr, ndtri
 
 from verify.evaluation.figures.style import (
@@ -40,22 +39,6 @@ BAND_ALPHA = 0.11
 PANEL_INCHES = (4.6, 4.3)
 SIDE_INCHES = 2.75
 EQUAL: dict[str, Any] = {"color": QUIET, "linewidth": 0.9}
-Draw = Callable[[Axes, Array, Array, Array, Array, dict[str, Any]], None]
-
-
-def det_figure(results: Mapping[str, Any]) -> Figure | None:
-    """Draw FNMR over FMR on normal-deviate axes; None where no lifted or raw curve is there.
-
-    One panel for each data set and mode. The metric is spherical where it was run, and of the
-    dimensions the smallest and the largest that all strategies of the panel have; raw descriptors
-    are in every panel as a reference. Bands are 95 %.
-    """
-    return _figure(results, draw_det, dress_det)
-
-
-def roc_figure(results: Mapping[str, Any]) -> Figure | None:
-    """Draw the true match rate, 1 - FNMR, over the logarithm of the FMR; else as `det_figure`."""
-    return _figure(results, _draw_roc, _dress_roc)
 
 
 def shown_curves(curves: Sequence[Row], mode: str) -> list[Row]:
@@ -76,7 +59,13 @@ def shown_curves(curves: Sequence[Row], mode: str) -> list[Row]:
     return sorted(raw + lifted, key=order_of)
 
 
-def _figure(results: Row, draw: Draw, dress: Callable[[Axes], None]) -> Figure | None:
+def det_figure(results: Mapping[str, Any]) -> Figure | None:
+    """Draw FNMR over FMR on normal-deviate axes; None where no lifted or raw curve is there.
+
+    One panel for each data set and mode. The metric is spherical where it was run, and of the
+    dimensions the smallest and the largest that all strategies of the panel have; raw descriptors
+    are in every panel as a reference. Bands are 95 %.
+    """
     curves = [curve for curve in results.get("curves", ()) if len(curve["fmr"]) > 1]
     names = [name for name in datasets_of(results) if any(c["dataset"] == name for c in curves)]
     present = {curve["mode"] for curve in curves}
@@ -105,10 +94,10 @@ def _figure(results: Row, draw: Draw, dress: Callable[[Axes], None]) -> Figure |
                         np.asarray(curve[key], dtype=np.float64)
                         for key in ("fmr", "fnmr", "low", "high")
                     )
-                    draw(axes, fmr, fnmr, low, high, _look(curve, shown, looks))
+                    draw_det(axes, fmr, fnmr, low, high, _look(curve, shown, looks))
                 axes.set_title(f"{name}, {_title(mode, shown)}", loc="left")
-                dress(axes)
-        _legend(figure, drawn, looks, diagonal=draw is draw_det)
+                dress_det(axes)
+        _legend(figure, drawn, looks)
     return figure
 
 
@@ -158,15 +147,6 @@ def draw_det(
     )
 
 
-def _draw_roc(
-    axes: Axes, fmr: Array, fnmr: Array, low: Array, high: Array, look: dict[str, Any]
-) -> None:
-    axes.plot(fmr, 100 * (1 - fnmr), **_markers(look, len(fmr)))
-    axes.fill_between(
-        fmr, 100 * (1 - high), 100 * (1 - low), color=look["color"], alpha=BAND_ALPHA, linewidth=0
-    )
-
-
 def _percent(value: float) -> str:
     return f"{100 * value:.4f}".rstrip("0").rstrip(".")
 
@@ -195,23 +175,7 @@ def dress_det(axes: Axes, x: str = "FMR", y: str = "FNMR") -> None:
     axes.grid(color=RULE, linewidth=0.8)
 
 
-def _dress_roc(axes: Axes) -> None:
-    lines = axes.get_lines()
-    axes.set_xscale("log")
-    axes.set_xlim(min(float(np.min(np.asarray(line.get_xdata()))) for line in lines), 1)
-    lowest = min(float(np.min(np.asarray(line.get_ydata()))) for line in lines)
-    floor = next((f for f in (98.0, 95.0, 90.0, 80.0, 50.0) if lowest >= f), 0.0)
-    axes.set_ylim(floor, 100 + (100 - floor) * 0.02)
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: _percent(value)))
-    axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.set_xlabel("FMR %")
-    axes.set_ylabel("true match rate, 1 - FNMR, %")
-    axes.grid(color=RULE, linewidth=0.8)
-
-
-def _legend(
-    figure: Figure, drawn: Sequence[Row], looks: Mapping[str, dict[str, Any]], *, diagonal: bool
-) -> None:
+def _legend(figure: Figure, drawn: Sequence[Row], looks: Mapping[str, dict[str, Any]]) -> None:
     """List strategies right of the panels, then what the dashes say of m."""
     labels = dict.fromkeys(strategy_label(curve) for curve in sorted(drawn, key=order_of))
     handles = [Line2D([], [], **looks[label], label=label) for label in labels]
@@ -234,6 +198,5 @@ def _legend(
                     [], [], color=QUIET, linestyle=dash, linewidth=1.7, label=f"{word}: m = {text}"
                 )
             )
-    if diagonal:
-        handles.append(Line2D([], [], **EQUAL, label="FMR = FNMR"))
+    handles.append(Line2D([], [], **EQUAL, label="FMR = FNMR"))
     side_legend(figure, handles, SIDE_INCHES)

@@ -20,8 +20,8 @@ from verify.evaluation.markdown_cells import (
     significant,
     table,
 )
-from verify.evaluation.results import Model, software
-from verify.evaluation.rows import Json
+from verify.evaluation.plan import Json
+from verify.evaluation.provenance import Model, software
 from verify.metrics import equal_error_rate, error_curve
 
 FORMAT = "veilface liveness evaluation"

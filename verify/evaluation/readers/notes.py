@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from verify.evaluation.verification_set import VerificationSet, unequal_folds
+from verify.evaluation.verification_set import VerificationSet
 from verify.tenfold import FOLDS
 
 PUBLISHED = {
@@ -23,8 +23,10 @@ def notes(benchmark: VerificationSet) -> list[str]:
     published = PUBLISHED.get(name)
     if published is not None and pairs != published:
         sentences.append(f"{name} has {pairs:,} pairs, the published set has {published:,}")
-    if unequal_folds(benchmark.same, benchmark.folds):
+    if benchmark.folds is not None:
         sizes = np.bincount(benchmark.folds, minlength=FOLDS)
+        genuine = np.bincount(benchmark.folds[benchmark.same], minlength=FOLDS)
+    if benchmark.folds is not None and (np.ptp(sizes) or np.ptp(genuine)):
         sentences.append(
             f"{name}: folds differ in their numbers of genuine or impostor pairs "
             f"({sizes.min():,} to {sizes.max():,} pairs a fold)"

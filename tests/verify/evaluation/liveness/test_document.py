@@ -8,7 +8,7 @@ import pytest
 
 from tests.verify.evaluation.liveness.sets import scored_set
 from verify.evaluation.liveness.document import OperatingPoint, document, markdown
-from verify.evaluation.results import Model
+from verify.evaluation.provenance import Model
 
 GENERATOR = np.random.default_rng(8)
 LIVE = GENERATOR.normal(1, 1, 40)

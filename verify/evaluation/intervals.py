@@ -8,22 +8,20 @@ draws, so that their mean can be taken replicate by replicate.
 """
 
 from collections.abc import Iterator
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from verify.evaluation.material import Material
+from verify.evaluation.comparison import Trials
 
 REPLICATES = 400
 GRID_POINTS = 49
 
 Array64 = NDArray[np.float64]
-Interval = Literal["subject-bootstrap", "pair-bootstrap"]
 
 
 def replicate_weights(
-    material: Material, *, seed: int, replicates: int = REPLICATES
+    trials: Trials, *, seed: int, replicates: int = REPLICATES
 ) -> Iterator[tuple[Array64, Array64]]:
     """Draw people with replacement; pairs, where the set does not name people.
 
@@ -35,7 +33,7 @@ def replicate_weights(
     impostor : (I,) float64
         Weights of the pairs. A replicate without any genuine or impostor pair is drawn anew.
     """
-    same, people = material.same, material.people
+    same, people = trials.same, trials.people
     generator = np.random.default_rng(seed)
     if people is not None:
         present, places = np.unique(people, return_inverse=True)
@@ -103,3 +101,16 @@ class OperatingPoints:
         k = np.searchsorted(accepted, allowed, side="right") - 1
         below = np.concatenate([[0.0], np.cumsum(genuine_weights[self._genuine_order])])
         return np.asarray(below[self._missed[self._possible[k]]] / below[-1])
+
+
+def percentiles(replicates: NDArray[np.float32]) -> tuple[Array64, Array64]:
+    """95 % interval of the mean over runs; (runs, R, F) to two (F,).
+
+    In each replicate the runs are drawn with replacement too, so that the interval holds what
+    comes from the choice of decoys as well as what comes from the choice of people.
+    """
+    runs, count, _ = replicates.shape
+    drawn = np.random.default_rng(runs).integers(runs, size=(runs, count))
+    means = replicates[drawn, np.arange(count)].mean(axis=0, dtype=np.float64)
+    low, high = np.percentile(means, [2.5, 97.5], axis=0)
+    return low, high

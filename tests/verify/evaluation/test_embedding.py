@@ -1,4 +1,5 @@
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -7,16 +8,15 @@ import pytest
 from models.cache import EmbeddingCache
 from models.decoding import decode_image
 from models.demo import build_demo_pack
-from models.extraction import Extractor
 from models.pack import ModelPack
 from models.synthetic import draw_face, encode_photo
-from verify.evaluation.acquisition import (
-    Acquired,
-    acquire,
+from verify.evaluation.embedding import (
+    EmbeddedSet,
+    FileEmbedder,
+    PackEmbedder,
     are_aligned,
     digest_of_pictures,
     digests,
-    from_file,
 )
 from verify.evaluation.embeddings_file import EmbeddingsFile
 from verify.evaluation.verification_set import (
@@ -26,6 +26,12 @@ from verify.evaluation.verification_set import (
     VerificationSet,
     contiguous_folds,
 )
+
+
+@contextmanager
+def no_progress(_: str, __: int) -> Iterator[Callable[[int], None]]:
+    yield lambda _: None
+
 
 BROKEN = b"\x89PNG\r\n\x1a\nnot a photo"
 FACES = [encode_photo(draw_face(number)) for number in range(6)]
@@ -76,18 +82,24 @@ def acquired(
     *,
     cache: EmbeddingCache | None = None,
     seen: list[int] | None = None,
-) -> Acquired:
-    extractor = Extractor(pack, aligned=True, cache=cache)
-    progress = ([] if seen is None else seen).append
-    return acquire(pairs, digests(pairs), extractor, progress=progress)
+) -> EmbeddedSet:
+    steps = [] if seen is None else seen
+
+    @contextmanager
+    def progress(_: str, total: int) -> Iterator[Callable[[int], None]]:
+        steps.append(total)
+        yield steps.append
+
+    embedder = PackEmbedder(pack, {}, mirrored=False, aligned=True)
+    return embedder.embed(pairs, cache=cache, progress=progress)
 
 
-def check_mixed(found: Acquired, pack: ModelPack) -> None:
+def check_mixed(found: EmbeddedSet, pack: ModelPack) -> None:
     crops = [decode_image(FACES[number]) for number in (0, 1, 2)]
     alone = np.concatenate([pack.embed(crop[None]) for crop in crops])
     np.testing.assert_array_equal(found.rows, [0, -1, 0, 1, -1, 2, 2, -1, -1])
-    np.testing.assert_allclose(found.descriptors, alone, atol=1e-6)
-    np.testing.assert_allclose(np.linalg.norm(found.descriptors, axis=1), 1, atol=1e-6)
+    np.testing.assert_allclose(found.embeddings, alone, atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(found.embeddings, axis=1), 1, atol=1e-6)
     names = [failure.path.as_posix() for failure in found.failures]
     assert names == ["broken", "broken too", "Cas/3.png", "Cas/4.png"]
     assert [failure.code for failure in found.failures[:2]] == ["unsupported_image"] * 2
@@ -99,7 +111,7 @@ def test_every_picture_has_a_row_or_a_reason(mixed: VerificationSet, pack: Model
     check_mixed(found, pack)
     assert [failure.code for failure in found.failures[2:]] == ["unreadable_file"] * 2
     # Equal pictures are worked on once, and those that cannot be read not at all.
-    assert seen == [5, 4]
+    assert seen == [4, 4]
 
 
 def test_equal_pictures_are_embedded_once(pack: ModelPack, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -131,7 +143,7 @@ def test_a_cache_serves_the_second_call(
 
     monkeypatch.setattr(ModelPack, "embed", refused)
     second = acquired(mixed, pack, cache=cache)
-    np.testing.assert_array_equal(first.descriptors, second.descriptors)
+    np.testing.assert_array_equal(first.embeddings, second.embeddings)
     np.testing.assert_array_equal(first.rows, second.rows)
     assert first.failures == second.failures
     with pytest.raises(AssertionError, match="embedded again"):
@@ -151,9 +163,10 @@ def test_photos_that_a_file_of_embeddings_lacks_failed_to_acquire() -> None:
     rows = np.eye(4, dtype=np.float32)
     embeddings = EmbeddingsFile(("c.png", "x.png", "a.png", "y.png"), rows, "0" * 64)
     pairs = verification_set([PictureBytes(f"{name}.png", b"") for name in "abcd"])
-    found = from_file(pairs, embeddings)
+    embedder = FileEmbedder(embeddings, "own.npz")
+    found = embedder.embed(pairs, cache=None, progress=no_progress)
     np.testing.assert_array_equal(found.rows, [0, -1, 1, -1])
-    np.testing.assert_array_equal(found.descriptors, rows[[2, 0]])
+    np.testing.assert_array_equal(found.embeddings, rows[[2, 0]])
     assert [(str(each.path), each.code) for each in found.failures] == [
         ("b.png", "not_in_file"),
         ("d.png", "not_in_file"),

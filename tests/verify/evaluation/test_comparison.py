@@ -9,26 +9,23 @@ from templates.distances import Metric, similarity
 from templates.errors import TemplateError
 from templates.keys.randomness import Keystream
 from templates.space.lifting import Strategy, lift
-from tests.verify.evaluation.materials import N, material, pool
-from verify.evaluation.material import Material
-from verify.evaluation.scoring import score_unit, split_pool, unit_layout
-from verify.evaluation.units import LiftUnit, Mode, RawUnit
+from tests.verify.evaluation.made_trials import N, made_trials, pool
+from verify.evaluation.comparison import Trials, compare, split_pool
+from verify.evaluation.plan import EvaluationPlan, Mode, Unit
 
-BOTH = (Mode.POINT, Mode.SUBSPACE)
+Found = dict[tuple[str, str, str | None], np.ndarray]
 
 
-def unit(strategy: Strategy = Strategy.ADVERSARIAL, **changes: object) -> LiftUnit:
-    given = {
-        "strategy": strategy,
-        "m": 4,
-        "source": None if strategy is Strategy.RANDOM else 0,
-        "shared": True,
-        "modes": BOTH,
-        "metrics": tuple(Metric),
-        "steps": 50,
-        "seed": 3,
+def compared(
+    trials: Trials, strategy: Strategy = Strategy.ADVERSARIAL, *, seed: int = 3, **changes: Any
+) -> Found:
+    """Similarities by mode, metric and lifted side, of one unit of m = 4."""
+    plan = EvaluationPlan((strategy,), **{"shared_decoys": True, **changes})
+    source = None if strategy is Strategy.RANDOM else 0
+    return {
+        (names["mode"], names["metric"], names["lifted"]): similarities
+        for names, similarities in compare(trials, Unit(strategy, 4, source, seed), plan)
     }
-    return LiftUnit(**{**given, **changes})  # type: ignore[arg-type]
 
 
 def residual(point: np.ndarray, foot: np.ndarray, rows: np.ndarray) -> float:
@@ -38,21 +35,19 @@ def residual(point: np.ndarray, foot: np.ndarray, rows: np.ndarray) -> float:
 
 
 def test_raw_similarities_are_cosines() -> None:
-    known = material()
-    (found,) = score_unit(known, RawUnit(flip=False))
-    one = known.descriptors[known.first].astype(float)
-    two = known.descriptors[known.second].astype(float)
+    known = made_trials()
+    ((names, found),) = compare(known, Unit("raw"), EvaluationPlan(("raw",)))
+    one = known.embeddings[known.first].astype(float)
+    two = known.embeddings[known.second].astype(float)
     cosines = (one * two).sum(axis=1)
     cosines /= np.linalg.norm(one, axis=1) * np.linalg.norm(two, axis=1)
-    np.testing.assert_allclose(found.similarities, cosines, atol=1e-12)
-    assert (found.cell.dim, found.cell.mode, found.lifted) == (0, Mode.RAW, None)
+    np.testing.assert_allclose(found, cosines, atol=1e-12)
+    assert (names["dim"], names["mode"], names["lifted"]) == (0, Mode.RAW, None)
 
 
 def test_each_side_is_lifted_and_the_other_compared_with_it() -> None:
-    known = material(pairs=40)
-    found = {
-        (s.cell.mode, s.cell.metric, s.lifted): s.similarities for s in score_unit(known, unit())
-    }
+    known = made_trials(pairs=40)
+    found = compared(known)
     assert set(found) == {
         (Mode.POINT, metric, side) for metric in Metric for side in ("first", "second")
     } | {(Mode.SUBSPACE, metric, "both") for metric in Metric}
@@ -62,7 +57,7 @@ def test_each_side_is_lifted_and_the_other_compared_with_it() -> None:
         with Keystream.seeded("evaluation", name, Strategy.ADVERSARIAL, 4, 3) as stream:
             sides.append(
                 lift(
-                    known.descriptors[photos],
+                    known.embeddings[photos],
                     strategy="adversarial",
                     m=4,
                     source=known.sources[0],
@@ -70,7 +65,7 @@ def test_each_side_is_lifted_and_the_other_compared_with_it() -> None:
                 )
             )
     for row in range(40):
-        a, b = known.descriptors[known.first[row]], known.descriptors[known.second[row]]
+        a, b = known.embeddings[known.first[row]], known.embeddings[known.second[row]]
         first, second = sides[0][row], sides[1][row]
         for probe, template, side in ((b, first, "first"), (a, second, "second")):
             distance = residual(probe, template.foot, template.basis)
@@ -84,37 +79,36 @@ def test_each_side_is_lifted_and_the_other_compared_with_it() -> None:
 
 
 def test_both_photos_are_projected_on_the_axes_of_a_generator() -> None:
-    known = material(people=60, pairs=30)
-    source = DecoyGenerator.fit(known.descriptors).reduced(N - 6)
+    known = made_trials(people=60, pairs=30)
+    source = DecoyGenerator.fit(known.embeddings).reduced(N - 6)
     known = dataclasses.replace(known, sources=(source,))
-    (found,) = score_unit(known, unit(modes=(Mode.POINT,), metrics=(Metric.EUCLIDEAN,)))[:1]
+    found = compared(known)[Mode.POINT, Metric.EUCLIDEAN, "first"]
     probes, enrolled = (
-        source.project(known.descriptors[photos]) for photos in (known.second, known.first)
+        source.project(known.embeddings[photos]) for photos in (known.second, known.first)
     )
     with Keystream.seeded("evaluation", "first", Strategy.ADVERSARIAL, 4, 3) as stream:
         lifted = lift(enrolled, strategy="adversarial", m=4, source=source, stream=stream)
     for row in range(30):
         distance = residual(probes[row], lifted[row].foot, lifted[row].basis)
-        assert found.similarities[row] == pytest.approx(similarity(distance), abs=1e-5)
+        assert found[row] == pytest.approx(similarity(distance), abs=1e-5)
 
 
 def test_a_device_gives_the_similarities_of_the_processor() -> None:
     pytest.importorskip("torch", reason="torch is an optional extra")
-    known = material(pairs=30)
-    here, there = (score_unit(known, unit(device=device)) for device in (None, "cpu"))
-    assert [scores.cell for scores in here] == [scores.cell for scores in there]
-    for one, other in zip(here, there, strict=True):
-        np.testing.assert_allclose(one.similarities, other.similarities, atol=5e-6)
+    known = made_trials(pairs=30)
+    here, there = (compared(known, device=device) for device in (None, "cpu"))
+    for name, similarities in here.items():
+        np.testing.assert_allclose(similarities, there[name], atol=5e-6)
     with pytest.raises(TemplateError, match="torch cannot use the device nowhere"):
-        score_unit(known, unit(device="nowhere"))
+        compared(known, device="nowhere")
 
 
 def test_seeds_change_lifts_and_one_seed_repeats_them() -> None:
-    known = material(pairs=20)
-    one, again, other = (score_unit(known, unit(seed=seed)) for seed in (1, 1, 2))
-    for left, right, different in zip(one, again, other, strict=True):
-        np.testing.assert_array_equal(left.similarities, right.similarities)
-        assert (left.similarities != different.similarities).any()
+    known = made_trials(pairs=20)
+    one, again, other = (compared(known, seed=seed) for seed in (1, 1, 2))
+    for name, similarities in one.items():
+        np.testing.assert_array_equal(similarities, again[name])
+        assert (similarities != other[name]).any()
 
 
 def test_halves_are_disjoint_and_cover_the_pool() -> None:
@@ -130,33 +124,33 @@ def test_halves_are_disjoint_and_cover_the_pool() -> None:
 
 def test_shared_decoys_make_strangers_meet_and_halves_do_not() -> None:
     # 12 entries, 4 decoys on each side: nearly every pair shares one.
-    few = Material(**{**vars(material(pairs=60)), "sources": (pool(12),)})
-    shared = score_unit(few, unit(modes=(Mode.SUBSPACE,), metrics=(Metric.EUCLIDEAN,)))[0]
-    apart = score_unit(
-        few, unit(modes=(Mode.SUBSPACE,), metrics=(Metric.EUCLIDEAN,), shared=False)
-    )[0]
-    assert shared.cell.shared_decoys is True
-    assert apart.cell.shared_decoys is False
-    strangers = ~few.same
+    few = dataclasses.replace(made_trials(pairs=60), sources=(pool(12),))
+    shared, apart = (
+        compared(few, shared_decoys=sharing)[Mode.SUBSPACE, Metric.EUCLIDEAN, "both"]
+        for sharing in (True, False)
+    )
     met = similarity(1e-3)
-    assert np.mean(shared.similarities[strangers] > met) > 0.7
-    assert not (apart.similarities[strangers] > met).any()
+    assert np.mean(shared[~few.same] > met) > 0.7
+    assert not (apart[~few.same] > met).any()
 
 
-def test_random_lifting_needs_no_decoys_and_generated_ones_are_not_halved() -> None:
-    generator = np.random.default_rng(0)
-    rows = generator.normal(size=(400, N))
-    made = DecoyGenerator.fit((rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype("f4"))
-    known = Material(**{**vars(material(pairs=20)), "sources": (made,)})
-    for cell, _ in unit_layout(unit(), known.sources):
-        assert (cell.decoys, cell.shared_decoys) == ("generator", None)
-    for cell, _ in unit_layout(unit(Strategy.RANDOM), known.sources):
-        assert (cell.decoys, cell.shared_decoys) == (None, None)
-    assert len(score_unit(known, unit(Strategy.RANDOM))) == 6
+@pytest.mark.parametrize(
+    ("strategy", "kind", "shared"),
+    [("random", None, None), ("adversarial", "generator", None), ("adversarial", "pool", True)],
+)
+def test_runs_name_their_decoys(strategy: str, kind: str | None, shared: bool | None) -> None:
+    known = made_trials(pairs=20)
+    if kind == "generator":
+        made = DecoyGenerator.fit(made_trials(people=200).embeddings)
+        known = dataclasses.replace(known, sources=(made,))
+    plan = EvaluationPlan((strategy,), shared_decoys=True)
+    runs = compare(known, Unit(strategy, 4, None if kind is None else 0, 0), plan)
+    assert len(runs) == 6
+    assert {(names["decoys"], names["shared_decoys"]) for names, _ in runs} == {(kind, shared)}
 
 
 def test_hybrid_plus_takes_the_attributes_of_each_photo(monkeypatch: pytest.MonkeyPatch) -> None:
-    known = material(pairs=30)
+    known = made_trials(pairs=30)
     asked: list[list[Attributes]] = []
     plain = DecoyPool.draw
 
@@ -165,14 +159,11 @@ def test_hybrid_plus_takes_the_attributes_of_each_photo(monkeypatch: pytest.Monk
         return plain(self, rows, k, **given)
 
     monkeypatch.setattr(DecoyPool, "draw", watched)
-    score_unit(
-        known, unit(Strategy.HYBRID_PLUS, modes=(Mode.SUBSPACE,), metrics=(Metric.SPHERICAL,))
-    )
+    compared(known, Strategy.HYBRID_PLUS)
     assert known.attributes is not None
     # The decoys of each photo are unlike its own attributes, those of the first side first.
     assert asked == [
         [known.attributes[photo] for photo in side] for side in (known.first, known.second)
     ]
-    without = Material(**{**vars(known), "attributes": None})
     with pytest.raises(ValueError, match="attributes"):
-        score_unit(without, unit(Strategy.HYBRID_PLUS))
+        compared(dataclasses.replace(known, attributes=None), Strategy.HYBRID_PLUS)

@@ -1,9 +1,9 @@
-"""Descriptors of made-up people, and pairs of them."""
+"""Embeddings of made-up people, and pairs of them."""
 
 import numpy as np
 
 from templates.decoys import Attributes, DecoyPool
-from verify.evaluation.material import Material
+from verify.evaluation.comparison import Trials
 from verify.evaluation.verification_set import contiguous_folds
 
 N = 24
@@ -24,9 +24,9 @@ def pool(entries: int = 120, *, n: int = N, labelled: bool = False, seed: int = 
     return DecoyPool(unit(generator.normal(size=(entries, n))), labels=labels)
 
 
-def material(
+def made_trials(
     *, people: int = 30, pairs: int = 100, named: bool = True, spread: float = 0.15, seed: int = 0
-) -> Material:
+) -> Trials:
     """Two photos of each person; genuine and impostor pairs in turn."""
     generator = np.random.default_rng(seed)
     centres = np.repeat(unit(generator.normal(size=(people, N))), 2, axis=0)
@@ -34,9 +34,10 @@ def material(
     same = np.arange(pairs) % 2 == 0
     first = generator.integers(people, size=pairs)
     second = np.where(same, first, (first + generator.integers(1, people, size=pairs)) % people)
-    return Material(
-        descriptors=rows,
-        flipped=None,
+    return Trials(
+        name="made",
+        embeddings=rows,
+        mirrored=None,
         first=(2 * first).astype(np.int64),
         second=(2 * second + 1).astype(np.int64),
         same=same,
@@ -46,4 +47,5 @@ def material(
             Attributes("Male" if k % 4 < 2 else "Female", "White") for k in range(2 * people)
         ],
         sources=(pool(labelled=True),),
+        kept=np.arange(pairs),
     )

@@ -1,0 +1,268 @@
+"""Runs, rows and curves against means, intervals and counts that are made anew."""
+
+import json
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from models.extraction import Failure
+from templates.distances import Metric
+from tests.verify.evaluation.made_trials import N, made_trials, pool
+from verify.datasets import DatasetError
+from verify.evaluation.comparison import Trials
+from verify.evaluation.embedding import EmbeddedSet
+from verify.evaluation.experiment import (
+    ROW,
+    SetResult,
+    averaged,
+    group_rates,
+    run_trials,
+    trials_of,
+)
+from verify.evaluation.intervals import fmr_grid, replicate_weights
+from verify.evaluation.labels_file import Labels
+from verify.evaluation.plan import EvaluationPlan, Mode
+from verify.evaluation.provenance import Model
+from verify.evaluation.results import collision_floor, curve_of, document, row_of
+from verify.evaluation.verification_set import PictureBytes, VerificationSet
+from verify.metrics import threshold_at_fmr, wilson
+
+PLAN = EvaluationPlan(("raw", "random", "adversarial"), dims=(2, 3), repeats=2, targets=(0.1, 1e-4))
+# One kind of run whose lifts differ much, so that the draw of runs shows.
+SPREAD = EvaluationPlan(
+    ("adversarial",),
+    dims=(2,),
+    modes=(Mode.SUBSPACE,),
+    metrics=(Metric.EUCLIDEAN,),
+    shared_decoys=True,
+    repeats=4,
+    targets=(0.05,),
+    steps=9,
+)
+
+
+def verification_set(pairs: int = 100, people: int = 30) -> VerificationSet:
+    known = made_trials(people=people, pairs=pairs)
+    return VerificationSet(
+        name="made",
+        kind="pairs",
+        pictures=tuple(PictureBytes(f"{i}", b"") for i in range(2 * people)),
+        first=known.first,
+        second=known.second,
+        same=known.same,
+        folds=known.folds,
+        people=tuple(f"p{i // 2}" for i in range(2 * people)),
+    )
+
+
+def run(plan: EvaluationPlan = PLAN, trials: Trials | None = None) -> pd.DataFrame:
+    with ThreadPoolExecutor(2) as executor:
+        return run_trials(trials or made_trials(), plan, executor=executor, progress=lambda _: None)
+
+
+def faces(rows: np.ndarray, **changes: Any) -> EmbeddedSet:
+    return EmbeddedSet(
+        **{"pairs": verification_set(), "embeddings": made_trials().embeddings, "rows": rows}
+        | {"failures": ()}
+        | changes
+    )
+
+
+def test_rows_are_means_of_their_runs() -> None:
+    trials = made_trials()
+    results = document(
+        PLAN,
+        Model(N, {}),
+        [],
+        run(),
+        [SetResult(faces(np.arange(60)), trials, (), None)],
+        None,
+        options={},
+    )
+    json.dumps(results, allow_nan=False)
+    rows, runs = results["rows"], results["runs"]
+    # raw by two searches; 2 strategies x 2 dims x 2 modes x 2 metrics.
+    assert len(rows) == 2 + 2 * 2 * 2 * 2
+    for row in rows:
+        own = [each for each in runs if all(each[key] == row[key] for key in ROW)]
+        sides = 2 if row["mode"] == "p2s" else 1
+        assert len(own) == row["runs"] == (1 if row["strategy"] == "raw" else 2 * sides)
+        means = [np.mean(each["accuracies"]) for each in own]
+        assert row["accuracy_mean"] == pytest.approx(np.mean(means))
+        assert row["accuracy_std"] == pytest.approx(
+            np.mean([np.std(each["accuracies"]) for each in own])
+        )
+        seeds = {each["seed"] for each in own}
+        by_seed = [
+            np.mean([m for m, each in zip(means, own, strict=True) if each["seed"] == seed])
+            for seed in seeds
+        ]
+        spread = pytest.approx(np.std(by_seed, ddof=1)) if len(seeds) > 1 else None
+        assert row["accuracy_std_seeds"] == spread
+        for figure in ("eer", "auc", "d_prime"):
+            assert row[figure] == pytest.approx(np.mean([each[figure] for each in own]))
+        at = row["fnmr_at_fmr"]["0.1"]
+        errors = [each["fnmr_at_fmr"]["0.1"]["errors"] for each in own]
+        assert at["value"] == pytest.approx(np.mean(errors) / 50)
+        assert at["ci_low"] <= at["value"] <= at["ci_high"]
+        assert at["fmr"] <= 0.1
+        assert "0.0001" not in row["fnmr_at_fmr"]
+    assert "made: FMR 0.0001 is not reported" in results["refused"][0]
+    assert len(results["curves"]) == len(rows) - 1
+
+
+def test_a_set_without_folds_has_every_figure_but_the_accuracy() -> None:
+    trials = made_trials()
+    plan = EvaluationPlan(("raw", "random"), dims=(2,), repeats=2, targets=(0.1,))
+    folded, plain = run(plan, trials), run(plan, replace(trials, folds=None))
+    # The grid is a search for the accuracy: without folds it has nothing to choose.
+    assert set(plain["threshold_search"]) == {"exact"}
+    row, other = (
+        row_of(lines[lines["strategy"] == "random"][:1], trials, plan, Model(N, {}))
+        for lines in (plain, folded)
+    )
+    missing = {name for name, value in row.items() if value is None}
+    assert missing - {name for name, value in other.items() if value is None} == {
+        *("accuracy_mean", "accuracy_std", "threshold_mean", "thresholds"),
+    }
+    assert row["fnmr_at_fmr"] == other["fnmr_at_fmr"]
+
+
+def test_pairs_without_an_embedding_are_counted() -> None:
+    pairs = verification_set()
+    lost = int(pairs.first[0])
+    rows = np.arange(60)
+    rows[lost] = -1
+    rows[rows > lost] -= 1
+    acquired = faces(
+        rows,
+        embeddings=np.delete(made_trials().embeddings, lost, axis=0),
+        failures=(Failure(Path(pairs.pictures[lost].name), "no_face", "No face was found."),),
+    )
+    known = trials_of(acquired, attributes=None, sources=())
+    touched = (pairs.first == lost) | (pairs.second == lost)
+    assert known.failed_genuine == np.count_nonzero(touched & pairs.same) > 0
+    assert known.failed_impostor == np.count_nonzero(touched & ~pairs.same)
+    assert known.fta == 1 / 60
+    np.testing.assert_array_equal(known.kept, np.flatnonzero(~touched))
+    np.testing.assert_array_equal(
+        known.embeddings[known.first], made_trials().embeddings[pairs.first[~touched]]
+    )
+    assert known.people is not None
+    numbers = {name: number for number, name in enumerate(sorted(set(pairs.people or ())))}
+    np.testing.assert_array_equal(
+        known.people[0], [numbers[f"p{i // 2}"] for i in pairs.first[~touched]]
+    )
+    with pytest.raises(DatasetError, match="without the 100 pairs that lack an embedding"):
+        trials_of(faces(np.full(60, -1)), attributes=None, sources=())
+
+
+def test_a_template_is_the_mean_of_its_photos_that_were_acquired() -> None:
+    rows = np.arange(60)
+    rows[[2, 5, 6]] = -1
+    found = averaged(faces(rows), [(0, 1), (2, 3), (4,), (5, 6)])
+    np.testing.assert_array_equal(found.rows, [0, 1, 2, -1])
+    photos = made_trials().embeddings.astype(float)
+    mean = photos[0] + photos[1]
+    np.testing.assert_allclose(found.embeddings[0], mean / np.linalg.norm(mean), atol=1e-6)
+    np.testing.assert_allclose(found.embeddings[1:], photos[[3, 4]], atol=1e-6)
+
+
+def test_rates_with_failures_follow_the_standard() -> None:
+    plan = EvaluationPlan(("raw",), targets=(0.1,))
+    trials = replace(made_trials(named=False), fta=0.04)
+    row = row_of(run(plan, trials)[:1], trials, plan, Model(N, {}))
+    at = row["fnmr_at_fmr"]["0.1"]
+    assert at["interval"] == "pair-bootstrap"
+    assert at["far"] == pytest.approx(at["fmr"] * 0.96)
+    assert at["frr"] == pytest.approx(0.04 + at["value"] * 0.96)
+
+
+@pytest.mark.parametrize(
+    ("strategy", "dim", "entries", "expected"),
+    [
+        # By hand: with 1 decoy of 10, the second side draws the same with probability 1/10.
+        ("hybrid", 2, 10, 0.1),
+        # 1 - C(8, 2) / C(10, 2)
+        ("adversarial", 2, 10, 1 - 28 / 45),
+        ("random", 2, 10, 0.0),
+        # One of 16 parts of 10 entries each, and inside it as above.
+        ("sub-adversarial", 2, 160, (1 - 28 / 45) / 16),
+        ("hybrid+", 2, 10, None),
+    ],
+)
+def test_the_collision_floor(strategy: str, dim: int, entries: int, expected: float | None) -> None:
+    source = pool(entries, labelled=True)
+    names = {"strategy": strategy, "shared_decoys": True, "dim": dim}
+    found = collision_floor(names, source)
+    assert found == (None if expected is None else pytest.approx(expected))
+    assert collision_floor(names | {"shared_decoys": False}, source) == 0
+
+
+def test_groups_are_counted_at_the_threshold_of_each_run() -> None:
+    plan = EvaluationPlan(("raw",), targets=(0.1,))
+    trials, runs = made_trials(), run(plan)
+    people = {f"{i}": {"side": "even" if i % 4 < 2 else "odd"} for i in range(60)}
+    groups, summaries = group_rates(
+        runs, [SetResult(faces(np.arange(60)), trials, (), None)], Labels(("side",), people), plan
+    )
+    threshold = runs["fnmr_at_fmr"].iloc[0]["0.1"]["threshold"]
+    cosines = (trials.embeddings[trials.first] * trials.embeddings[trials.second]).sum(axis=1)
+    even = (trials.first % 4 < 2) & (trials.second % 4 < 2)
+    (found,) = (group for group in groups if group["group"] == "even")
+    assert found["fmr"]["trials"] == np.count_nonzero(even & ~trials.same)
+    assert found["fmr"]["errors"] == np.count_nonzero((cosines >= threshold) & even & ~trials.same)
+    assert summaries[0]["threshold"] == threshold
+
+
+def written_out(known: Trials, runs: pd.DataFrame, fmr: float) -> tuple[float, float]:
+    """95 % interval of the mean FNMR: trials repeated as often as they were drawn, run by run."""
+    every = []
+    for genuine, impostor in replicate_weights(known, seed=0):
+        rates = []
+        for similarities in runs["similarities"]:
+            mated, other = similarities[known.same], similarities[~known.same]
+            threshold = threshold_at_fmr(np.repeat(other, impostor.astype(int)), fmr)
+            rates.append(np.mean(np.repeat(mated, genuine.astype(int)) < threshold))
+        every.append(rates)
+    rates = np.array(every)
+    chosen = np.random.default_rng(99).integers(len(runs), size=(20, *rates.shape))
+    means = [np.take_along_axis(rates, draw, axis=1).mean(axis=1) for draw in chosen]
+    low, high = np.percentile(np.concatenate(means), [2.5, 97.5])
+    return float(low), float(high)
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_intervals_are_those_of_replicates_written_out(named: bool) -> None:
+    known = made_trials(people=40, pairs=400, named=named)
+    runs = run(SPREAD, known)
+    at = row_of(runs, known, SPREAD, Model(N, {}))["fnmr_at_fmr"]["0.05"]
+    low, high = written_out(known, runs, 0.05)
+    # Its own threshold in every replicate makes it much wider than the errors alone would.
+    bounds = wilson(at["errors_mean"], 200)
+    assert high - low > 1.5 * (bounds[1] - bounds[0])
+    assert at["ci_low"] == pytest.approx(low, abs=0.05)
+    assert at["ci_high"] == pytest.approx(high, abs=0.05)
+    assert at["interval"] == ("subject-bootstrap" if named else "pair-bootstrap")
+
+
+def test_the_band_of_a_curve_is_that_of_replicates_written_out() -> None:
+    known = made_trials(people=40, pairs=400)
+    runs = run(SPREAD, known)
+    curve = curve_of(runs, known)
+    grid = fmr_grid(200)
+    np.testing.assert_allclose(curve["fmr"], grid)
+    for place in (10, 25, 40):
+        low, high = written_out(known, runs, grid[place])
+        assert curve["low"][place] == pytest.approx(low, abs=0.05)
+        assert curve["high"][place] == pytest.approx(high, abs=0.05)
+    # One run has the spread of people only.
+    alone = curve_of(runs[:1], known)
+    low, high = np.percentile(runs["replicates"].iloc[0][:, 1:], [2.5, 97.5], axis=0)
+    np.testing.assert_allclose(alone["low"], low, atol=1e-6)
+    np.testing.assert_allclose(alone["high"], high, atol=1e-6)

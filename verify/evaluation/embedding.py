@@ -1,0 +1,198 @@
+"""From the photos of a set to embeddings: by a model pack, or from a file that has them."""
+
+import hashlib
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.cache import EmbeddingCache
+from models.decoding import image_size
+from models.extraction import Extractor, Failure, named
+from models.pack import ModelPack
+from verify.evaluation.embeddings_file import EmbeddingsFile, match
+from verify.evaluation.plan import EvaluationError, Json
+from verify.evaluation.provenance import Model
+from verify.evaluation.verification_set import Indices, Picture, VerificationSet
+
+Advance = Callable[[int], None]
+Progress = Callable[[str, int], AbstractContextManager[Advance]]
+"""Begins a task of so many steps; gives what is called with the steps done since the last call."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class EmbeddedSet:
+    """A set with the embeddings of its photos.
+
+    Parameters
+    ----------
+    embeddings : (k, n) float32
+        Unit rows of the photos that were acquired.
+    rows : (len(pictures),) int64
+        Row of each photo; -1 where it failed.
+    failures
+        The others, with the reason; ``path`` is the photo's name.
+    mirrored : (k, n) float32, optional
+        The same rows with the mirror image added.
+    aligned
+        Whether the photos were taken for aligned crops; None where they were not embedded here.
+    pictures_sha256
+        Of all photos; empty where they were not read.
+    """
+
+    pairs: VerificationSet
+    embeddings: NDArray[np.float32]
+    rows: Indices
+    failures: tuple[Failure, ...]
+    mirrored: NDArray[np.float32] | None = None
+    aligned: bool | None = None
+    pictures_sha256: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class FileEmbedder:
+    """Embeddings that were computed elsewhere."""
+
+    file: EmbeddingsFile
+    name: str
+
+    @property
+    def model(self) -> Model:
+        """Name and SHA-256 of the file."""
+        facts: Json = {"embeddings": self.name, "sha256": self.file.sha256}
+        return Model(int(self.file.descriptors.shape[1]), facts)
+
+    def embed(
+        self, pairs: VerificationSet, *, cache: EmbeddingCache | None, progress: Progress
+    ) -> EmbeddedSet:
+        """Take the embeddings of a set from the file; absent ones failed to acquire."""
+        del cache, progress
+        positions = match(self.file, pairs)
+        present = positions >= 0
+        return EmbeddedSet(
+            pairs,
+            np.ascontiguousarray(self.file.descriptors[positions[present]]),
+            np.where(present, np.cumsum(present) - 1, -1),
+            tuple(
+                Failure(Path(pairs.pictures[place].name), "not_in_file", "The file lacks it.")
+                for place in np.flatnonzero(~present).tolist()
+            ),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class PackEmbedder:
+    """A model pack.
+
+    Parameters
+    ----------
+    mirrored
+        Whether embeddings with the mirror image are wanted beside those without.
+    aligned
+        Whether the photos are aligned crops; None to see for each set.
+    """
+
+    pack: ModelPack
+    facts: Json
+    mirrored: bool
+    aligned: bool | None
+
+    @property
+    def model(self) -> Model:
+        """What a contract binds of the pack, and the recorded facts."""
+        info = self.pack.info
+        return Model(info.n, self.facts, info.embedder_sha256, info.preprocessing)
+
+    def embed(
+        self, pairs: VerificationSet, *, cache: EmbeddingCache | None, progress: Progress
+    ) -> EmbeddedSet:
+        """Embed the photos of a set, equal ones once; those that fail are counted.
+
+        Raises
+        ------
+        EvaluationError
+            Nothing can align the photos.
+        """
+        contents = digests(pairs)
+        aligned = self._aligned(pairs)
+        first_of: dict[str, Picture] = {}
+        for picture, content in zip(pairs.pictures, contents, strict=True):
+            if content:
+                first_of.setdefault(content, picture)
+        extractor = Extractor(self.pack, aligned=aligned, cache=cache, mirrored=self.mirrored)
+        sources = [picture.source for picture in first_of.values()]
+        with progress(f"embedding {pairs.name}", len(sources)) as advance:
+            extraction = extractor.extract(sources, progress=advance)
+        row_of = {str(path): row for row, path in enumerate(extraction.paths)}
+        reason_of = {str(failure.path): failure for failure in extraction.failures}
+        reason_of[""] = Failure(Path(), "unreadable_file", "The file cannot be read.")
+        names = [str(named(first_of[content].source)) if content else "" for content in contents]
+        return EmbeddedSet(
+            pairs,
+            extraction.descriptors,
+            np.array([row_of.get(name, -1) for name in names], dtype=np.int64),
+            tuple(
+                Failure(Path(picture.name), reason_of[name].code, reason_of[name].reason)
+                for picture, name in zip(pairs.pictures, names, strict=True)
+                if name not in row_of
+            ),
+            extraction.mirrored,
+            aligned,
+            digest_of_pictures(contents),
+        )
+
+    def _aligned(self, pairs: VerificationSet) -> bool:
+        size = int(self.pack.info.preprocessing["size"])
+        aligned = pairs.aligned if self.aligned is None else self.aligned
+        if aligned is None:
+            aligned = are_aligned(pairs, size)
+        marked = all(picture.keypoints is not None for picture in pairs.pictures)
+        if not aligned and not marked and self.pack.info.detector is None:
+            raise EvaluationError(
+                f"the pack has no detector, and the photos of {pairs.name} are not all crops of "
+                f"{size} x {size}: use a pack with a detector, or say that they are "
+                "crops of another size (aligned)"
+            )
+        return aligned
+
+
+Embedder = PackEmbedder | FileEmbedder
+
+
+def digests(pairs: VerificationSet) -> list[str]:
+    """SHA-256 of every photo, in the order of the set; a photo that cannot be read has none.
+
+    One photo is in memory at a time.
+    """
+    contents = []
+    for picture in pairs.pictures:
+        try:
+            contents.append(hashlib.sha256(picture.read()).hexdigest())
+        except OSError:
+            contents.append("")
+    return contents
+
+
+def digest_of_pictures(contents: Sequence[str]) -> str:
+    """Name the photos of a set: equal for equal photos in equal order, whatever holds them."""
+    return hashlib.sha256("".join(contents).encode()).hexdigest()
+
+
+def are_aligned(pairs: VerificationSet, size: int) -> bool:
+    """Whether all photos, as far as they are any, have exactly the embedder's input size.
+
+    Photos out of a camera, and those of LFW (250 × 250), are larger.
+    """
+    any_read = False
+    for picture in pairs.pictures:
+        try:
+            size_read = image_size(picture.read())
+        except OSError:
+            continue
+        if size_read not in (None, (size, size)):
+            return False
+        any_read = any_read or size_read is not None
+    return any_read
