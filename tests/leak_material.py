@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from api.process.preparation import binding_for
 from models.cache import EmbeddingCache
 from models.decoding import decode_image
 from models.errors import FaceError
@@ -19,6 +18,7 @@ from templates.decoys import DecoyPool
 from templates.keys.sealing import KeyringSealer, MasterKeyring
 from templates.space.lifting import Strategy
 from verify import CalibrationOptions, calibrate
+from verify.preparation import binding_for
 
 PEOPLE = 4
 PHOTOS = 3

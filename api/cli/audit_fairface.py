@@ -11,8 +11,15 @@ from api.cli.console import message
 from api.cli.descriptors import BULK, Aligned, Cache, Flip, bulk_pack, extract
 from api.cli.errors import UsageError, require_extra
 from api.cli.inputs import fairface_labels, listed_dims, listed_names, load_decoys
-from api.cli.options import PROCESSOR, AsJson, Device, chosen_device, quick, takes_settings
-from api.process.preparation import DEFAULT_DIM, acquired_json
+from api.cli.options import (
+    DEFAULT_DIM,
+    PROCESSOR,
+    AsJson,
+    Device,
+    chosen_device,
+    quick,
+    takes_settings,
+)
 from api.service.opening import file_sealer, open_keyring
 from api.settings import Settings
 from attacks.attributes.attackers import TRAINED
@@ -34,6 +41,7 @@ from templates.distances import on_device
 from templates.errors import VeilfaceError
 from templates.space.lifting import Strategy
 from verify.fairface_labels import CLASSES
+from verify.preparation import acquired_json
 
 STRATEGIES = (
     "raw",

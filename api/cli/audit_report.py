@@ -14,13 +14,13 @@ from rich.table import Table
 from api.cli.console import demo_notice, emit, say, share_done, show, table
 from api.cli.errors import FAILED
 from api.cli.html_report import write_html
-from api.process.preparation import recorded_of
 from attacks.outcomes import Scheme
 from attacks.report import RESULTS, Document
 from attacks.report_tables import markdown
 from attacks.verdict import LIMITS
 from models.pack import ModelPack
 from templates.keys.private_file import replace_public
+from verify.preparation import recorded_of
 
 Out = Annotated[Path, typer.Option(help="Folder of the report.")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed for everything random.")]

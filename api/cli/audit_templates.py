@@ -12,8 +12,15 @@ from api.cli.console import message
 from api.cli.descriptors import BULK, Aligned, Cache, Flip, bulk_pack, extract
 from api.cli.errors import UsageError, require_extra
 from api.cli.inputs import further_faces, listed_dims, load_decoys
-from api.cli.options import PROCESSOR, AsJson, Device, chosen_device, quick, takes_settings
-from api.process.preparation import DEFAULT_DIM, acquired_json
+from api.cli.options import (
+    DEFAULT_DIM,
+    PROCESSOR,
+    AsJson,
+    Device,
+    chosen_device,
+    quick,
+    takes_settings,
+)
 from api.service.opening import file_sealer, open_keyring
 from api.settings import Settings
 from attacks.audit import AuditPlan, run_audit
@@ -27,6 +34,7 @@ from templates.errors import VeilfaceError
 from templates.keys.sealing import Sealer
 from templates.space.lifting import Strategy
 from verify import labelled_folder
+from verify.preparation import acquired_json
 
 
 @takes_settings(*BULK)

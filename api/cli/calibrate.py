@@ -8,22 +8,16 @@ from typing import Annotated, Any
 import typer
 
 from api.cli.calibrate_liveness import set_liveness_threshold, with_liveness_of
-from api.cli.console import demo_notice, emit, say, share_done, show, table
+from api.cli.calibration import DEFAULT_PROBE_DIM, calibrate_folder, default_probe_dims
+from api.cli.console import demo_notice, share_done
 from api.cli.descriptors import BULK, Aligned, Cache, Flip, bulk_pack, each_person_once, extract
 from api.cli.errors import CommandError, UsageError
 from api.cli.files import read_bounded, read_names
 from api.cli.groups import estimated_labels, group_tables, labels_of
-from api.cli.inputs import fairface_labels, load_decoys
-from api.cli.options import AsJson, takes_settings
+from api.cli.inputs import fairface_labels, listed_numbers, load_decoys
 from api.cli.photo_folders import people_or_faces
+from api.cli.results import Result, Table, reports
 from api.cli.verdict import improvements, shown_rate, verdict_lines
-from api.process.preparation import (
-    DEFAULT_PROBE_DIM,
-    acquired,
-    acquired_json,
-    calibrate_folder,
-    default_probe_dims,
-)
 from api.service.opening import file_sealer, open_keyring
 from api.settings import Settings
 from templates.contract.binding import MAX_M
@@ -32,6 +26,7 @@ from templates.distances import Metric
 from templates.space.lifting import Strategy
 from verify import CalibrationOptions, CalibrationReport
 from verify.evaluation.labels_file import read_labels
+from verify.preparation import acquired, acquired_json
 
 MOST_SHOWN = 20
 
@@ -43,7 +38,7 @@ class Protocol(StrEnum):
     TEN_FOLD = "ten-fold"
 
 
-@takes_settings(*BULK)
+@reports(*BULK)
 def calibrate(
     folder: Annotated[
         Path | None,
@@ -154,8 +149,7 @@ def calibrate(
         ),
     ] = 0.05,
     seed: Annotated[int, typer.Option(min=0, help="Seed for the random choices.")] = 0,
-    as_json: AsJson = False,
-) -> None:
+) -> Result:
     """Calibrate on labelled people, and write the contract file.
 
     Needs: a model pack, a decoys file, and photos of people with two photos or more each. 80
@@ -168,8 +162,7 @@ def calibrate(
     """
     path = out or settings.resolved_contract_file
     if liveness is not None and folder is None:
-        set_liveness_threshold(liveness, path, settings, bpcer=bpcer, as_json=as_json)
-        return
+        return set_liveness_threshold(liveness, path, settings, bpcer=bpcer)
     if folder is None or liveness is not None:
         raise UsageError("give the folder of labelled people, or --liveness and its photos")
     dims = default_probe_dims(dim) if probe_dims is None else parse_dims(probe_dims)
@@ -223,48 +216,33 @@ def calibrate(
     contract = with_liveness_of(path, done.contract, pack, sealer)
     contract.save(path, sealer)
     notice = demo_notice(pack.info.embedder_sha256, n=pack.info.n)
-    if as_json:
-        emit(
-            {
-                "out": str(path),
-                **notice,
-                "contract": contract.public(),
-                "failure_to_acquire": acquired_json(extraction),
-                "chosen": done.point.chosen,
-                "tried": [one.to_json() for one in done.point.tried],
-                **_report_json(done.report),
-            }
-        )
-        return
-    for calibration in done.contract.calibrations:
-        show(levels_table(calibration))
-    show(*group_tables(done.contract))
-    _tell(done.contract, done.report)
-    say(f"{acquired(extraction)}.")
-    say(f"{path}: contract {done.contract.contract_id[:16]}.")
-    for line in (*improvements(done.contract, done.point), *verdict_lines(done.contract.verdict)):
-        say(line)
+    return Result(
+        {
+            "out": path,
+            **notice,
+            "contract": contract.public(),
+            "failure_to_acquire": acquired_json(extraction),
+            "chosen": done.point.chosen,
+            "tried": done.point.tried,
+            **_report_facts(done.report),
+        },
+        [
+            *map(levels_table, done.contract.calibrations),
+            *group_tables(done.contract),
+            *_report_text(done.contract, done.report),
+            f"{acquired(extraction)}.",
+            f"{path}: contract {done.contract.contract_id[:16]}.",
+            *improvements(done.contract, done.point),
+            *verdict_lines(done.contract.verdict),
+        ],
+    )
 
 
 def parse_dims(text: str) -> tuple[int, ...]:
-    """Read ``2,4,8``, or ``none``.
-
-    Raises
-    ------
-    UsageError
-        Something else, or a dimension twice.
-    """
+    """Read ``2,4,8``, or ``none``; :class:`UsageError` for anything else."""
     if text.strip() == "none":
         return ()
-    parts = [part.strip() for part in text.split(",") if part.strip()]
-    if not parts or not all(part.isdecimal() and 1 <= int(part) <= 128 for part in parts):
-        raise UsageError(
-            "--probe-dims takes dimensions from 1 to 128, separated by commas, or none"
-        )
-    dims = tuple(int(part) for part in parts)
-    if len(set(dims)) != len(dims):
-        raise UsageError("--probe-dims names a dimension twice")
-    return dims
+    return listed_numbers(text, "--probe-dims", least=1, most=128)
 
 
 def read_aliases(file: Path) -> dict[str, str]:
@@ -284,7 +262,7 @@ def read_aliases(file: Path) -> dict[str, str]:
     return names
 
 
-def levels_table(calibration: Calibration) -> Any:
+def levels_table(calibration: Calibration) -> Table:
     """Show what one calibration found."""
     photos = calibration.probe_photos
     kind = (
@@ -294,10 +272,8 @@ def levels_table(calibration: Calibration) -> Any:
         if photos == 1
         else f"raw probes, means of {photos} photos"
     )
-    columns = ("level", "score", "FMR seen (95 %)", "FNMR seen (95 %)", "FNMR by photos enrolled")
-    listing = table(f"{kind}, {calibration.metric} distance", *columns)
-    for level in calibration.levels:
-        listing.add_row(
+    rows = [
+        (
             level.name,
             f"{level.threshold:.3f}",
             shown_rate(level.fmr),
@@ -307,23 +283,23 @@ def levels_table(calibration: Calibration) -> Any:
                 for number, rate in sorted(level.fnmr_by_photos.items())
             ),
         )
-    return listing
+        for level in calibration.levels
+    ]
+    columns = ("level", "score", "FMR seen (95 %)", "FNMR seen (95 %)", "FNMR by photos enrolled")
+    return Table(f"{kind}, {calibration.metric} distance", columns, rows)
 
 
-def _tell(contract: Contract, report: CalibrationReport) -> None:
-    for sentence in report.unresolved:
-        say(f"Not set: {sentence}.")
-    for sentence in report.left_out:
-        say(f"Not in the rule of the worst group: {sentence}.")
-    for line in suspicious_lines(report, "name the same people in --aliases"):
-        say(line)
+def _report_text(contract: Contract, report: CalibrationReport) -> list[str]:
     consistency = report.consistency
-    say(
+    return [
+        *(f"Not set: {sentence}." for sentence in report.unresolved),
+        *(f"Not in the rule of the worst group: {sentence}." for sentence in report.left_out),
+        *suspicious_lines(report, "name the same people in --aliases"),
         f"Default level: {contract.default_level}. Photos of one enrollment must agree to "
         f"{contract.photo_consistency:.3f}: {shown_rate(consistency.refused)} of the genuine sets "
         f"do not; {shown_rate(consistency.fmr)} of the pairs of two people do. Photos of one probe "
-        f"must agree to {contract.probe_consistency:.3f}."
-    )
+        f"must agree to {contract.probe_consistency:.3f}.",
+    ]
 
 
 def suspicious_lines(report: CalibrationReport, remedy: str) -> list[str]:
@@ -344,21 +320,19 @@ def _quoted(name: str) -> str:
     return '"' + name.replace('"', '""') + '"' if "," in name or '"' in name else name
 
 
-def _report_json(report: CalibrationReport) -> dict[str, Any]:
+def _report_facts(report: CalibrationReport) -> dict[str, Any]:
+    consistency = report.consistency
     return {
         "photo_consistency": {
-            "threshold": report.consistency.threshold,
-            "probe_threshold": report.consistency.probe_threshold,
-            "fmr": report.consistency.fmr.to_json(),
-            "refused": report.consistency.refused.to_json(),
+            "threshold": consistency.threshold,
+            "probe_threshold": consistency.probe_threshold,
+            "fmr": consistency.fmr,
+            "refused": consistency.refused,
         },
-        "unresolved": list(report.unresolved),
-        "left_out_of_worst_group": list(report.left_out),
+        "unresolved": report.unresolved,
+        "left_out_of_worst_group": report.left_out,
         "suspicious_above": report.suspicious_above,
-        "suspicious": [
-            {"first": pair.first, "second": pair.second, "cosine": pair.cosine}
-            for pair in report.suspicious
-        ],
+        "suspicious": report.suspicious,
         "ten_fold": [
             {
                 "accuracy_mean": folds.accuracy_mean,

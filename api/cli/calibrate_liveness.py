@@ -3,10 +3,11 @@
 from dataclasses import replace
 from pathlib import Path
 
-from api.cli.console import demo_notice, emit, message, say, show, table
+from api.cli.console import demo_notice, message
 from api.cli.descriptors import bulk_pack
 from api.cli.errors import CommandError, UsageError
 from api.cli.evaluate_liveness import require_liveness, score_with_progress
+from api.cli.results import Result, Table
 from api.cli.verdict import shown_rate
 from api.service.opening import file_sealer, open_keyring
 from api.settings import Settings
@@ -19,9 +20,7 @@ from verify.evaluation.liveness.presentations import read_presentations
 from verify.evaluation.liveness.rates import calibrate_liveness
 
 
-def set_liveness_threshold(
-    data: Path, file: Path, settings: Settings, *, bpcer: float, as_json: bool
-) -> None:
+def set_liveness_threshold(data: Path, file: Path, settings: Settings, *, bpcer: float) -> Result:
     """Set the threshold at a BPCER on live photos, and store it in a contract file.
 
     Raises
@@ -53,30 +52,28 @@ def set_liveness_threshold(
     calibration = calibrate_liveness(scored, liveness.graphs, target=bpcer)
     replace(contract, liveness=calibration).save(file, sealer)
     notice = demo_notice(pack.info.embedder_sha256, n=pack.info.n)
-    if as_json:
-        emit(
-            {
-                **notice,
-                "out": str(file),
-                "contract_id": contract.contract_id,
-                "liveness": calibration.to_json(),
-            }
-        )
-        return
-    listing = table(f"liveness, threshold {calibration.threshold:.4g}", "photos", "error", "seen")
-    listing.add_row("live", "BPCER", shown_rate(calibration.bpcer))
-    for species, rate in calibration.apcer.items():
-        listing.add_row(species, "APCER", shown_rate(rate))
-    show(listing)
     worst = calibration.worst_species
-    if worst is None:
-        say("No attack photos: what passes at this threshold was not measured.")
-    else:
-        say(
-            f"Worst species: {worst}, of which {shown_rate(calibration.apcer[worst])} pass. Other "
-            "photos give other rates: `veilface evaluate liveness`."
-        )
-    say(f"{file}: contract {contract.contract_id[:16]}.")
+    species = [(name, "APCER", shown_rate(rate)) for name, rate in calibration.apcer.items()]
+    return Result(
+        {
+            **notice,
+            "out": file,
+            "contract_id": contract.contract_id,
+            "liveness": calibration,
+        },
+        [
+            Table(
+                f"liveness, threshold {calibration.threshold:.4g}",
+                ("photos", "error", "seen"),
+                [("live", "BPCER", shown_rate(calibration.bpcer)), *species],
+            ),
+            "No attack photos: what passes at this threshold was not measured."
+            if worst is None
+            else f"Worst species: {worst}, of which {shown_rate(calibration.apcer[worst])} pass. "
+            "Other photos give other rates: `veilface evaluate liveness`.",
+            f"{file}: contract {contract.contract_id[:16]}.",
+        ],
+    )
 
 
 def with_liveness_of(file: Path, contract: Contract, pack: ModelPack, sealer: Sealer) -> Contract:

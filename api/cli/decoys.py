@@ -15,19 +15,13 @@ from api.cli.errors import CommandError, UsageError
 from api.cli.files import is_left_out, read_names
 from api.cli.photo_folders import find_photos
 from api.cli.results import Result, reports
-from api.process.preparation import (
-    LikeSample,
-    acquired,
-    acquired_json,
-    make_generator,
-    make_pool,
-)
 from api.service.opening import file_sealer, open_keyring
 from api.settings import Settings
 from models.extraction import Extraction
 from templates.decoys import Attributes, DecoyGenerator
 from templates.decoys.fitting import FACES_PER_DIMENSION
 from verify.fairface_labels import label_files, read_labels
+from verify.preparation import LikeSample, acquired, acquired_json, make_generator, make_pool
 
 app = typer.Typer(no_args_is_help=True)
 

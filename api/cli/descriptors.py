@@ -8,13 +8,13 @@ import typer
 
 from api.cli.console import message
 from api.cli.errors import CommandError, UsageError
-from api.process.preparation import acquired, without_lookalikes
 from api.service.opening import file_sealer, open_keyring
 from api.settings import Settings
 from models.cache import EmbeddingCache
 from models.extraction import Extraction, Extractor
 from models.pack import ModelPack
 from models.sessions import default_workers
+from verify.preparation import acquired, without_lookalikes
 
 BULK = ("pack", "providers", "data_dir", "database_url", "master_key_file")
 

@@ -12,7 +12,6 @@ from api.cli.errors import CommandError, UsageError, require_extra
 from api.cli.html_report import write_html
 from api.cli.inputs import listed, load_decoys
 from api.cli.options import AsJson, takes_settings
-from api.process.preparation import recorded_of
 from api.service.opening import file_sealer, open_keyring
 from api.settings import Settings
 from attacks.impostor_presentations import verify_presentations
@@ -35,6 +34,7 @@ from verify.evaluation.markdown_cells import interval_cell, significant
 from verify.evaluation.plan import Json
 from verify.evaluation.provenance import Model
 from verify.evaluation.tables import write_csv
+from verify.preparation import recorded_of
 
 
 @takes_settings(*BULK)

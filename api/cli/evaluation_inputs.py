@@ -7,7 +7,6 @@ from pathlib import Path
 from api.cli.console import message
 from api.cli.descriptors import bulk_pack
 from api.cli.errors import CommandError, UsageError
-from api.process.preparation import recorded_of, require_made_with
 from api.service.opening import file_sealer, open_keyring
 from api.settings import Settings
 from models.sessions import default_workers
@@ -19,6 +18,7 @@ from verify.evaluation.plan import RAW_FLIP
 from verify.evaluation.readers import notes, open_sets
 from verify.evaluation.sources import SourceFacts
 from verify.evaluation.verification_set import VerificationSet
+from verify.preparation import recorded_of, require_made_with
 
 NO_PACK = "none"
 

@@ -2,9 +2,8 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
-from api.cli.console import table
+from api.cli.results import Table
 from api.cli.verdict import shown_rate
 from attacks.operating_point import ADVISED_PHOTOS
 from models.extraction import Extraction
@@ -42,7 +41,7 @@ def estimated_labels(
     )
 
 
-def group_tables(contract: Contract) -> list[Any]:
+def group_tables(contract: Contract) -> list[Table]:
     """Show the rates of every group at the default level, for one photo and for as many as advised.
 
     ``--json`` has those of all levels and numbers of photos.
@@ -57,20 +56,21 @@ def group_tables(contract: Contract) -> list[Any]:
     return tables
 
 
-def _group_table(level: Level, *, photos: int) -> Any:
-    listing = table(
+def _group_table(level: Level, *, photos: int) -> Table:
+    return Table(
         f"by group at {level.name}, probes of {photos_in_words(photos)}; "
         "* too few trials to be judged",
-        *("attribute", "group", "FMR within (95 %)", "FRR (95 %)"),
+        ("attribute", "group", "FMR within (95 %)", "FRR (95 %)"),
+        [
+            (
+                entry.attribute,
+                entry.group,
+                _marked(entry.fmr, judged=entry.fmr_judged),
+                _marked(entry.frr, judged=entry.frr_judged),
+            )
+            for entry in level.groups
+        ],
     )
-    for entry in level.groups:
-        listing.add_row(
-            entry.attribute,
-            entry.group,
-            _marked(entry.fmr, judged=entry.fmr_judged),
-            _marked(entry.frr, judged=entry.frr_judged),
-        )
-    return listing
 
 
 def _marked(rate: Rate, *, judged: bool) -> str:

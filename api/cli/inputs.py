@@ -8,7 +8,6 @@ from typing import TypeVar
 from api.cli.descriptors import extract
 from api.cli.errors import CommandError, UsageError
 from api.cli.photo_folders import find_photos
-from api.process.preparation import require_made_with
 from api.settings import Settings
 from attacks.further_faces import FurtherFaces
 from models.pack import ModelPack
@@ -17,6 +16,7 @@ from templates.decoys import DecoySource, load_source
 from templates.keys.sealing import Sealer
 from verify.evaluation.embeddings_file import read_embeddings
 from verify.fairface_labels import Label, read_labels
+from verify.preparation import require_made_with
 
 T = TypeVar("T")
 

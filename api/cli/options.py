@@ -46,6 +46,8 @@ Device = Annotated[
     ),
 ]
 PROCESSOR = "cpu"
+DEFAULT_DIM = 64
+"""Dimension that an audit attacks where it is told none."""
 
 
 def quick(**smaller: Any) -> Any:

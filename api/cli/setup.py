@@ -1,62 +1,52 @@
-"""``veilface setup``: from a pack and photos to a service that is judged and ready to start."""
+"""``veilface setup``: from a pack and photos to a service that is judged and ready to start.
+
+Every step keeps what is there. Embeddings, which take the time, are kept in a sealed cache until
+the contract is written, so that a run that was stopped goes on.
+"""
 
 import os
 import shlex
 import sys
-import time
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from api.cli.calibrate import suspicious_lines
-from api.cli.console import demo_notice, emit, message, say, share_done
-from api.cli.decoys import like_sample, photos_of
+from api.cli.calibration import calibrate_folder, default_probe_dims
+from api.cli.console import demo_notice, message, share_done
+from api.cli.decoys import like_sample
 from api.cli.descriptors import Aligned, Flip, bulk_pack, each_person_once, extract
 from api.cli.errors import CommandError, UsageError
+from api.cli.files import read_bounded
 from api.cli.inputs import load_decoys
-from api.cli.master_keys import is_from_file
+from api.cli.master_keys import is_from_file, opened_store
 from api.cli.options import AsJson, takes_settings
 from api.cli.photo_folders import find_photos, labelled_people
-from api.cli.setup_files import (
-    api_key_file,
-    keep_api_key,
-    master_key_source,
-    report_master_key,
-    report_step,
-    write_settings,
-)
+from api.cli.results import Result, present
+from api.cli.roles import Roles, assign_roles, promises, resolved_rates, with_several
 from api.cli.verdict import verdict_lines
-from api.process.preparation import (
-    CalibratedFolder,
-    acquired,
-    calibrate_folder,
-    default_probe_dims,
-    make_generator,
-)
-from api.process.roles import (
-    Roles,
-    promises,
-    resolved_rates,
-    split_faces,
-    split_people,
-    with_several,
-)
+from api.http.audit import operator
 from api.service.opening import file_sealer, open_contract, open_keyring, weak_privacy
-from api.settings import DEFAULT_CONFIG_FILE, Settings, config_file
+from api.service.settings_file import settings_text
+from api.settings import DEFAULT_CONFIG_FILE, Settings, config_file, load_settings
 from models.extraction import Extraction
 from models.pack import ModelPack
 from templates.contract.document import Contract
 from templates.decoys import DecoyGenerator, DecoySource
+from templates.keys.private_file import create_private, replace_private, replace_public
 from templates.keys.sealing import MasterKeyring
 from templates.space.lifting import Strategy
+from templates.store.api_keys import Right
 from verify import CalibrationOptions, LabelledFolder
 from verify.datasets import visible
 from verify.evaluation.attributes import resembling_rows
 from verify.own_decoys import SAME_PHOTO
+from verify.preparation import acquired, make_generator
 
-CACHES = "setup-*.cache"
+RIGHTS = (Right.ENROLL, Right.VERIFY, Right.ERASE)
+HEADER = "Written by `veilface setup`; docs/settings.md has the rest."
 
 
 @takes_settings("pack", "providers", "data_dir", "master_key_file", "accept_weak_privacy")
@@ -107,7 +97,7 @@ def setup(
     `veilface.toml`, which `veilface serve` reads. What is there already is kept: a run that was
     stopped goes on when it is started again. Exit status 1: there is no threshold; the templates
     are not private, and `serve` will refuse them without --accept-weak-privacy; or a settings
-    file of somebody else has `serve` start another service.
+    file that is there has `serve` start another service.
 
     Example: `veilface setup --faces fairface/train --pack buffalo_l`
     """
@@ -116,103 +106,67 @@ def setup(
         raise UsageError("--like adapts the decoys to people like those of PEOPLE: give PEOPLE too")
     labelled = None if people is None else _labelled(people)
     roles = assign_roles(labelled, faces, like or [])
-    can, cannot = promises(roles, n=pack.info.n)
-    plan = {
-        **_plan(roles, pack, settings),
-        "labelled": labelled is not None,
-        "can": can,
-        "cannot": cannot,
-    }
-    resolves = bool(resolved_rates(roles.calibration))
-    if not as_json:
-        _tell_plan(plan)
-    elif dry_run or not resolves:
-        emit(plan)
-    if not resolves:
-        raise CommandError(
+    plan = _plan(roles, pack, settings, labelled=labelled is not None)
+    nothing = None
+    if not resolved_rates(roles.calibration):
+        nothing = (
             f"there is nothing to serve: {people or faces[0]} resolves no rate of false matches"
         )
+    if dry_run or nothing or not as_json:
+        present(Result(plan, _plan_text(plan), error=nothing), json=as_json)
     if dry_run:
         return
-    made: dict[str, str] = {}
-    report_master_key(made, settings)
-    keyring = open_keyring(settings)
-    contract = _prepared(
-        labelled, roles, pack, keyring, settings, made, like=like or [], aligned=aligned
-    )
-    key = keep_api_key(settings, keyring, made)
-    misled = write_settings(settings, made)
-    weakness = weak_privacy(contract)
-    refused = weakness is not None and not settings.accept_weak_privacy
-    notice = demo_notice(pack.info.embedder_sha256, n=pack.info.n)
-    if as_json:
-        verdict = None if contract.verdict is None else contract.verdict.to_json()
-        emit({**plan, "steps": made, "verdict": verdict, "servable": not refused, **notice})
+    steps: dict[str, str] = {}
+    if is_from_file(settings):
+        _report(steps, "master key", settings.resolved_master_key_file)
     else:
-        for line in verdict_lines(contract.verdict)[:2]:
-            say(line)
-        say(f"API key with the rights {', '.join(sorted(key.rights))}: {plan['api_key_file']}")
-    if refused:
-        message(
-            f"error: `veilface serve` refuses this contract: {weakness}. Remove it and the decoys, "
-            "and set up again with more photos; or accept it knowingly: run this again with "
+        steps["master key"] = "given"
+    keyring = open_keyring(settings)
+    cache = settings.data_dir / "setup.cache"
+    contract = _prepared(
+        labelled, roles, pack, keyring, settings, steps,
+        like=like or [], aligned=aligned, cache=cache,
+    )  # fmt: skip
+    cache.unlink(missing_ok=True)
+    _keep_api_key(settings, keyring, steps)
+    weakness = None if settings.accept_weak_privacy else weak_privacy(contract)
+    if weakness is not None:
+        error: str | None = (
+            f"`veilface serve` refuses this contract: {weakness}. Remove it and the decoys, and "
+            "set up again with more photos; or accept it knowingly: run this again with "
             "--accept-weak-privacy"
         )
-    if misled is not None:
-        message(f"error: {misled}")
-    if refused or misled is not None:
-        raise typer.Exit(1)
-    if as_json and not serve:
-        return
-    # Imported here: a server takes long to load.
-    from api.cli.serve import service_url
+    else:
+        error = _write_settings(settings, steps)
+    notice = demo_notice(pack.info.embedder_sha256, n=pack.info.n)
+    facts = {
+        **plan,
+        "steps": steps,
+        "verdict": contract.verdict,
+        "servable": weakness is None,
+        **notice,
+    }
+    key_file = api_key_file(settings)
+    text = [
+        *verdict_lines(contract.verdict)[:2],
+        f"API key with the rights {', '.join(sorted(RIGHTS))}: {key_file}",
+    ]
+    if error is None:
+        # Imported here: a server takes long to load.
+        from api.cli.serve import service_url
 
-    if not as_json:
-        if not serve:
-            say("Start it: veilface serve")
-        _tell_calls(service_url(settings), api_key_file(settings))
+        text += [] if serve else ["Start it: veilface serve"]
+        text += _calls(service_url(settings), key_file)
+    present(Result(facts, text, error=error), json=as_json)
     if serve:
         # Anew: this process has run the models, and what accelerators have begun outlives no fork.
         sys.stdout.flush()
         os.execv(sys.executable, [sys.executable, "-P", "-m", "veilface", "serve"])  # noqa: S606
 
 
-def assign_roles(
-    labelled: LabelledFolder | None, faces: Sequence[Path], like: Sequence[Path]
-) -> Roles:
-    """Give every photo one role; people are told apart by the names of their folders.
-
-    Without ``labelled`` each of the faces is a person of its own.
-
-    Raises
-    ------
-    CommandError
-        No face is left to fit decoys to, or no photo of ``like``.
-    """
-    if labelled is None:
-        kept, calibration = split_faces(photos_of(faces, frozenset())[0])
-        if not kept:
-            raise CommandError("--faces has too few photos to fit decoys to")
-        return Roles(kept, (), calibration)
-    albums: dict[str, list[Path]] = {}
-    for path, name in zip(labelled.paths, labelled.identities, strict=True):
-        albums.setdefault(name, []).append(path)
-    names, left_out = frozenset(albums), 0
-    sample: Sequence[Path]
-    if like:
-        sample, left_out = photos_of(like, names)
-        calibration = albums
-        names |= {path.parent.name for path in sample if path.parent not in like}
-        if not sample:
-            raise CommandError("everybody in --like is in PEOPLE too; name folders of others")
-    else:
-        sample, calibration = split_people(albums)
-    others, more = photos_of(faces, names)
-    taken = {path.resolve() for path in (*labelled.paths, *sample)}
-    kept = tuple(path for path in others if path.resolve() not in taken)
-    if not kept:
-        raise CommandError("everybody in --faces is in PEOPLE or --like; name folders of others")
-    return Roles(kept, tuple(sample), calibration, left_out + more + len(others) - len(kept))
+def api_key_file(settings: Settings) -> Path:
+    """Where the API key is kept: with the master key, not with the data."""
+    return settings.resolved_master_key_file.parent / "api-key"
 
 
 def _labelled(people: Path) -> LabelledFolder:
@@ -227,8 +181,9 @@ def _labelled(people: Path) -> LabelledFolder:
     return labelled_people(people)
 
 
-def _plan(roles: Roles, pack: ModelPack, settings: Settings) -> dict[str, Any]:
-    info = pack.info
+def _plan(roles: Roles, pack: ModelPack, settings: Settings, *, labelled: bool) -> dict[str, Any]:
+    info, contract = pack.info, settings.resolved_contract_file
+    can, cannot = promises(roles, n=info.n)
     return {
         "pack": {
             "name": info.name,
@@ -241,50 +196,60 @@ def _plan(roles: Roles, pack: ModelPack, settings: Settings) -> dict[str, Any]:
         "people": len(roles.calibration),
         "people_with_several_photos": with_several(roles.calibration),
         "photos": roles.photos,
-        "decoys_file": str(settings.resolved_decoys_file),
-        "contract_file": str(settings.resolved_contract_file),
-        "contract_kept": settings.resolved_contract_file.exists(),
-        "master_key": master_key_source(settings),
-        "master_key_file": str(settings.resolved_master_key_file)
-        if is_from_file(settings)
-        else None,
-        "api_key_file": str(api_key_file(settings)),
-        "settings_file": str(config_file() or DEFAULT_CONFIG_FILE),
+        "decoys_file": settings.resolved_decoys_file,
+        "contract_file": contract,
+        "contract_kept": contract.exists(),
+        "master_key_file": settings.resolved_master_key_file if is_from_file(settings) else None,
+        "api_key_file": api_key_file(settings),
+        "settings_file": config_file() or DEFAULT_CONFIG_FILE,
+        "labelled": labelled,
+        "can": can,
+        "cannot": cannot,
     }
 
 
-def _tell_plan(plan: dict[str, Any]) -> None:
+def _plan_text(plan: Mapping[str, Any]) -> list[str]:
     pack = plan["pack"]
     detector = pack["detector"] or "none: photos must be aligned crops"
-    say(f"Pack:       {pack['name']}, {pack['n']} numbers per embedding, detector {detector}")
     adapted = f", adapted to {plan['sample']:,} photos" if plan["sample"] else ""
-    say(f"Decoys:     {plan['faces']:,} faces{adapted}")
     alone = "" if plan["labelled"] else ", each of --faces taken for a person"
-    say(f"Thresholds: {plan['people']:,} people, {plan['photos']:,} photos{alone}")
+    files = [str(path) for name, path in plan.items() if name.endswith("_file") and path]
+    text = [
+        f"Pack:       {pack['name']}, {pack['n']} numbers per embedding, detector {detector}",
+        f"Decoys:     {plan['faces']:,} faces{adapted}",
+        f"Thresholds: {plan['people']:,} people, {plan['photos']:,} photos{alone}",
+        f"Files:      {', '.join(files)}",
+        *(f"Can be promised:    {sentence}." for sentence in plan["can"]),
+        *(f"Cannot be promised: {sentence}." for sentence in plan["cannot"]),
+    ]
     if plan["left_out"]:
-        say(f"Left out:   {plan['left_out']:,} photos of people who have another role")
-    files = [path for name, path in plan.items() if name.endswith("_file") and path is not None]
-    say(f"Files:      {', '.join(files)}")
-    for sentence in plan["can"]:
-        say(f"Can be promised:    {sentence}.")
-    for sentence in plan["cannot"]:
-        say(f"Cannot be promised: {sentence}.")
+        text.append(f"Left out:   {plan['left_out']:,} photos of people who have another role")
     if plan["contract_kept"]:
-        say(
+        text.append(
             f"These are promises of a contract made anew. {plan['contract_file']} is there and "
             "kept: what it promises is in its own verdict."
         )
+    return text
 
 
-def _tell_calls(service: str, key_file: Path) -> None:
+def _calls(service: str, key_file: Path) -> list[str]:
     """Show the page, and the two calls that a newcomer makes first, ready to paste."""
-    say(f"Page:     open {service}/ and sign in with the key in {key_file}")
     key = f'-H "Authorization: Bearer $(cat {shlex.quote(str(key_file))})"'
     person = f"{service}/v1/subjects/anna"
-    say(
-        f"Enroll:   curl -X PUT {person}/enrollment {key} -F images=@anna1.jpg -F images=@anna2.jpg"
-    )
-    say(f"Verify:   curl -X POST {person}/verify {key} -F image=@anna3.jpg")
+    return [
+        f"Page:     open {service}/ and sign in with the key in {key_file}",
+        f"Enroll:   curl -X PUT {person}/enrollment {key} -F images=@anna1.jpg "
+        "-F images=@anna2.jpg",
+        f"Verify:   curl -X POST {person}/verify {key} -F image=@anna3.jpg",
+    ]
+
+
+def _report(steps: dict[str, str], step: str, file: Path) -> bool:
+    """Say whether a step's file is there and kept, which is returned, or is made now."""
+    kept = file.exists()
+    steps[step] = "kept" if kept else "made"
+    message(f"... {step}: {f'{file} is there and kept' if kept else f'making {file}'}")
+    return kept
 
 
 def _prepared(
@@ -293,79 +258,61 @@ def _prepared(
     pack: ModelPack,
     keyring: MasterKeyring,
     settings: Settings,
-    made: dict[str, str],
+    steps: dict[str, str],
     *,
     like: Sequence[Path],
     aligned: bool,
+    cache: Path,
 ) -> Contract:
     """Build the decoys and calibrate, or keep what is there."""
-    path, sealer = settings.resolved_contract_file, file_sealer(keyring)
-    decoys_kept = report_step(made, "decoys", settings.resolved_decoys_file)
-    contract_kept = path.exists()
-    source = load_decoys(settings.resolved_decoys_file, sealer, pack) if decoys_kept else None
-    if contract_kept:
-        report_step(made, "contract", path)
+    path, decoys = settings.resolved_contract_file, settings.resolved_decoys_file
+    sealer = file_sealer(keyring)
+    decoys_kept = _report(steps, "decoys", decoys)
+    source: DecoySource | None = load_decoys(decoys, sealer, pack) if decoys_kept else None
+    if _report(steps, "contract", path):
         contract = open_contract(settings, keyring)
         if source is None:
             raise CommandError(f"{path} has lost its decoys; remove it to make both anew")
         served = source.reduced(contract.binding.axes)
         contract.binding.require_source(source_id=served.source_id, made_with=source.made_with)
-        _drop_caches(settings)
         return contract
-    # Sealed, and only while this runs: so that a run that is stopped goes on.
-    cache = settings.data_dir / CACHES.replace("*", roles.digest[:16])
-    if source is not None:
-        _require_same_roles(settings, cache)
-    calibrated_on = [photo for album in roles.calibration.values() for photo in album]
-    photos = calibrated_on if source is not None else [*roles.faces, *roles.sample, *calibrated_on]
+    if decoys_kept:
+        message(
+            "note: the decoys were there: see to it that nobody in PEOPLE is among the photos "
+            "that they were made of"
+        )
+    names: list[str] = []
+    calibrated_on: list[Path] = []
+    for name, album in roles.calibration.items():
+        names += [name] * len(album)
+        calibrated_on += album
+    photos = calibrated_on if decoys_kept else [*roles.faces, *roles.sample, *calibrated_on]
     message(f"... embedding {len(photos):,} photos")
-    began = time.monotonic()
     extraction = extract(pack, photos, aligned=aligned, settings=settings, cache=cache)
-    seconds = max(time.monotonic() - began, 1e-3)
-    speed = (extraction.attempts - extraction.cached) / seconds
-    before = f", {extraction.cached:,} embedded before" if extraction.cached else ""
-    message(f"... {acquired(extraction)}{before}, {speed:.0f} photos a second")
+    message(f"... {acquired(extraction)}, {extraction.cached:,} embedded before")
     if labelled is None:
         extraction = each_person_once(extraction)
     people = part_of(extraction, calibrated_on)
     if source is None:
         folders = like or ([] if labelled is None else [labelled.root])
         source = _fitted(extraction, roles, people, pack, folders=folders)
-        source.save(settings.resolved_decoys_file)
-    report_step(made, "contract", path)
-    names = [name for name, album in roles.calibration.items() for _ in album]
     root = settings.data_dir if labelled is None else labelled.root
-    folder = LabelledFolder(root, tuple(calibrated_on), tuple(names), ())
-    done = _calibrated(folder, people, pack, source)
+    with share_done("calibrating") as report:
+        done = calibrate_folder(
+            LabelledFolder(root, tuple(calibrated_on), tuple(names), ()),
+            people,
+            pack=pack,
+            source=source,
+            strategy=Strategy.ADVERSARIAL,
+            options=CalibrationOptions(probe_dims=(0, *default_probe_dims(None))),
+            progress=lambda _what, share: report(share),
+        )
     for line in suspicious_lines(done.report, "put the photos of one person into one folder"):
         message(line)
-    contract = done.contract
-    contract.save(path, sealer)
-    _drop_caches(settings)
-    return contract
-
-
-def _drop_caches(settings: Settings) -> None:
-    """Delete the embeddings of this run, or of one that was stopped after its contract."""
-    for pattern in (CACHES, f".{CACHES}.*"):  # the second: drafts of a run that was killed
-        for file in settings.data_dir.glob(pattern):
-            file.unlink()
-
-
-def _require_same_roles(settings: Settings, cache: Path) -> None:
-    """Refuse decoys of another split; those of another command are the caller's affair."""
-    others = [file for file in settings.data_dir.glob(CACHES) if file != cache]
-    if cache.exists():
-        return
-    if others:
-        raise CommandError(
-            f"photos were added or removed since {settings.resolved_decoys_file} was made, so that "
-            "somebody may be in two roles: remove that file to build the decoys anew"
-        )
-    message(
-        "note: the decoys are of another command: see to it that nobody in PEOPLE is among the "
-        "photos that they were made of"
-    )
+    if isinstance(source, DecoyGenerator) and not decoys_kept:
+        source.save(decoys)
+    done.contract.save(path, sealer)
+    return done.contract
 
 
 def part_of(extraction: Extraction, photos: Collection[Path]) -> Extraction:
@@ -400,16 +347,56 @@ def _fitted(
     return make_generator(faces, pack, like=like_sample(sample, folders) if sample.paths else None)
 
 
-def _calibrated(
-    folder: LabelledFolder, extraction: Extraction, pack: ModelPack, source: DecoySource
-) -> CalibratedFolder:
-    with share_done("calibrating") as report:
-        return calibrate_folder(
-            folder,
-            extraction,
-            pack=pack,
-            source=source,
-            strategy=Strategy.ADVERSARIAL,
-            options=CalibrationOptions(probe_dims=(0, *default_probe_dims(None))),
-            progress=lambda _what, share: report(share),
-        )
+def _keep_api_key(settings: Settings, keyring: MasterKeyring, steps: dict[str, str]) -> None:
+    """See to it that a private file holds a key that the store takes."""
+    file = api_key_file(settings)
+    with opened_store(settings, keyring) as store:
+        is_there = file.exists()
+        if is_there and store.api_keys.verify(read_token(file)) is not None:
+            _report(steps, "API key", file)
+            return
+        steps["API key"] = "made"
+        why = f"the store does not take the one of {file}: making another" if is_there else ""
+        message(f"... API key: {why or f'making {file}'}")
+        store.tenants.create(settings.default_tenant)
+        new = store.api_keys.create(settings.default_tenant, RIGHTS, label="setup", by=operator())
+        write = replace_private if is_there else create_private
+        write(file, f"{new.token}\n".encode())
+
+
+def read_token(file: Path) -> str:
+    """Read the token of an API key from its file."""
+    return read_bounded(file, 4096).decode("ascii", "replace").strip()
+
+
+def _write_settings(settings: Settings, steps: dict[str, str]) -> str | None:
+    """Write the settings file, or keep the one that is there.
+
+    Returns
+    -------
+    str or None
+        What is wrong where that file would have another service started.
+    """
+    names = ["data_dir", "pack"]
+    names += ["master_key_file"] if settings.master_key_file is not None else []
+    names += ["accept_weak_privacy"] if settings.accept_weak_privacy else []
+    if settings.providers != Settings.model_fields["providers"].default:
+        names.append("providers")
+    text = settings_text({name: getattr(settings, name) for name in names}, HEADER)
+    file = config_file() or DEFAULT_CONFIG_FILE
+    if not _report(steps, "settings", file):
+        replace_public(file, text.encode())
+        return None
+    served = load_settings()
+    other = [name for name in names if _in_full(served, name) != _in_full(settings, name)]
+    if not other:
+        return None
+    return (
+        f"{file} was kept, and says something else of {', '.join(other)}, so that `veilface serve` "
+        f"would not start what was set up here; it should say\n{text}"
+    )
+
+
+def _in_full(settings: Settings, name: str) -> Any:
+    value = getattr(settings, name)
+    return value.absolute() if isinstance(value, Path) else value

@@ -21,12 +21,12 @@ from typing import Any
 
 import httpx
 
+from api.cli.calibration import calibrate_folder, default_probe_dims
 from api.demo.people import ENROLLED_PHOTOS, PROBE_PHOTOS, Cast, Scale, drawn_cast, found_cast
 from api.demo.service import running_service
 from api.demo.storage import KEY_FILE, Stored, read_stored, rows_of
 from api.http.errors import StartError
 from api.http.receipts import read_receipt_key, verify_answer
-from api.process.preparation import calibrate_folder, default_probe_dims, make_generator
 from api.service.opening import file_sealer, weak_privacy
 from api.service.settings_file import settings_text
 from models.demo import build_demo_pack, is_demo_model
@@ -37,6 +37,7 @@ from templates.contract.verdict import Verdict
 from templates.keys.sealing import MasterKeyring
 from templates.space.lifting import Strategy
 from verify import CalibrationOptions, LabelledFolder
+from verify.preparation import make_generator
 
 MARKER = "# Written by `veilface demo`, which replaces this folder when it runs again."
 # A run fails if the level's FMR makes so many accepted impostors less likely than this.

@@ -3,7 +3,7 @@
 from collections.abc import Collection
 from pathlib import Path
 
-from api.process.preparation import calibrate_folder, make_generator
+from api.cli.calibration import calibrate_folder
 from api.settings import Settings
 from models.extraction import Extractor
 from models.pack import ModelPack
@@ -11,6 +11,7 @@ from templates.contract.document import Contract
 from templates.distances.blas import single_threaded
 from templates.space.lifting import Strategy
 from verify import CalibrationOptions, LabelledFolder, labelled_folder
+from verify.preparation import make_generator
 
 
 def calibrated_on_lfw(

@@ -8,7 +8,6 @@ from typing import Any
 
 from api.demo.people import Scale
 from api.demo.run import run_demo
-from api.process.preparation import recorded_of
 from api.service.opening import file_sealer, open_keyring
 from api.settings import Settings
 from models.pack import ModelPack
@@ -19,6 +18,7 @@ from tests.api.real_people import calibrated_on_lfw
 from tests.clients.conftest import Running, started
 from tests.marked_heads import frame, write_marked_pack
 from tests.web.served import Served, serving
+from verify.preparation import recorded_of
 
 DECOY_FACES = 110
 PEOPLE = 32

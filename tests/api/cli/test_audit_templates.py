@@ -16,7 +16,7 @@ import attacks.audit
 import attacks.population
 import attacks.system
 from api.cli import audit_templates
-from api.process.preparation import DEFAULT_DIM
+from api.cli.options import DEFAULT_DIM
 from api.service.opening import file_sealer, open_keyring
 from api.settings import Settings
 from attacks.audit import AuditPlan, AuditResult

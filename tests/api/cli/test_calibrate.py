@@ -12,7 +12,7 @@ from templates.contract.document import Contract
 from templates.contract.verdict import Judgement, Verdict
 from templates.decoys import DecoyGenerator
 from templates.keys.sealing import MasterKeyring
-from tests.api.cli.conftest import AXES, DIM, PROBE_DIM, key_file, run
+from tests.api.cli.conftest import AXES, DIM, PROBE_DIM, key_file
 from verify.metrics import rate
 
 
@@ -343,15 +343,6 @@ def test_a_folder_of_another_layout_is_refused(world, veilface, tmp_path):
     ran = veilface("calibrate", tmp_path, "--pack", world.pack)
     assert ran.status == 1
     assert "expected root/Person/photo.jpg" in ran.stderr
-
-
-def test_a_dimension_that_the_descriptor_does_not_have_is_refused(world, data):
-    ran = run(
-        *("calibrate", world.labelled, "--pack", world.pack, "--data-dir", data),
-        *("--probe-dims", "2,2"),
-    )
-    assert ran.status == 2
-    assert "twice" in ran.stderr
 
 
 @pytest.mark.parametrize(("text", "dims"), [("none", ()), ("2,4, 8", (2, 4, 8)), ("16", (16,))])

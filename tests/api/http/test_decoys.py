@@ -5,7 +5,6 @@ from pathlib import Path
 import pytest
 
 from api.http.errors import StartError
-from api.process.preparation import binding_for, require_made_with
 from api.service.opening import open_decoys, open_keyring
 from models.pack import ModelPack
 from templates.contract.document import Contract
@@ -13,6 +12,7 @@ from templates.decoys import DecoyGenerator
 from templates.errors import ContractMismatch
 from templates.space.lifting import Strategy
 from tests.api.deployment import Deployment, deploy, make_contract, make_source
+from verify.preparation import binding_for, require_made_with
 
 ELSEWHERE = "5a" * 32
 

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from api.process.preparation import recorded_of
 from models.decoding import decode_image
 from models.errors import FaceError
 from models.faces import FaceCrop
 from models.pack import ModelPack
 from tests.api.deployment import write_pack
 from tests.clients.javascript.conftest import Node
+from verify.preparation import recorded_of
 
 Image = NDArray[np.uint8]
 

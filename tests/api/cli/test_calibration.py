@@ -5,18 +5,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from api.cli.calibration import operating_point
 from api.cli.verdict import verdict_lines
-from api.process.preparation import _operating_point, without_lookalikes
 from models.extraction import Extraction
 from templates.contract.verdict import Verdict
 from templates.space.lifting import Strategy
 from tests.verify.population import N, decoys, photos_of, unit
 from verify import CalibrationOptions
+from verify.preparation import without_lookalikes
 
 
 @pytest.mark.parametrize("asked", [None, 8])
 def test_so_few_people_show_nothing_of_any_dimension(asked: int | None) -> None:
-    point = _operating_point(
+    point = operating_point(
         photos_of(30, 2, seed=4).reshape(-1, N),
         [str(number // 2) for number in range(60)],
         decoys(),

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from api.process.roles import Roles, attacked_and_others, promises, resolved_rates, split_people
+from api.cli.roles import Roles, attacked_and_others, promises, resolved_rates, split_people
 
 
 def albums(*counts: tuple[int, int]) -> dict[str, list[Path]]:
@@ -97,12 +97,3 @@ def test_promises_name_what_is_missing() -> None:
     nobody = roles(albums((10, 1)), faces=2_048, sample=300)
     can, cannot = promises(nobody, n=512)
     assert "any false match rate: 10 people are too few" in cannot[0]
-
-
-def test_the_digest_is_of_faces_and_sample() -> None:
-    people = albums((30, 4))
-    first = roles(people, faces=300, sample=100)
-    assert first.digest == roles(albums((31, 4)), faces=300, sample=100).digest
-    assert first.digest != roles(people, faces=299, sample=100).digest
-    assert first.digest != roles(people, faces=300, sample=99).digest
-    assert first.digest == Roles(tuple(reversed(first.faces)), first.sample, people).digest

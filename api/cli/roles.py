@@ -11,8 +11,11 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from api.cli.decoys import photos_of
+from api.cli.errors import CommandError
 from attacks.privacy import LEAST_FACES, LEAST_VICTIMS, MOST_ATTACKED
 from templates.decoys.fitting import FACES_PER_DIMENSION, MIN_DESCRIPTORS
+from verify import LabelledFolder
 from verify.metrics import resolvable
 from verify.thresholds import EXPECTED_ERRORS, TARGETS
 
@@ -54,11 +57,43 @@ class Roles:
         """Number of photos of the calibration."""
         return sum(map(len, self.calibration.values()))
 
-    @property
-    def digest(self) -> str:
-        """SHA-256 (hex) of who is in the fit of the decoys: the same for the same files."""
-        parts = ("\n".join(sorted(map(str, role))) for role in (self.faces, self.sample))
-        return hashlib.sha256("\0".join(parts).encode("utf-8", "surrogateescape")).hexdigest()
+
+def assign_roles(
+    labelled: LabelledFolder | None, faces: Sequence[Path], like: Sequence[Path]
+) -> Roles:
+    """Give every photo one role; people are told apart by the names of their folders.
+
+    Without ``labelled`` each of the faces is a person of its own.
+
+    Raises
+    ------
+    CommandError
+        No face is left to fit decoys to, or no photo of ``like``.
+    """
+    if labelled is None:
+        kept, calibration = split_faces(photos_of(faces, frozenset())[0])
+        if not kept:
+            raise CommandError("--faces has too few photos to fit decoys to")
+        return Roles(kept, (), calibration)
+    albums: dict[str, list[Path]] = {}
+    for path, name in zip(labelled.paths, labelled.identities, strict=True):
+        albums.setdefault(name, []).append(path)
+    names, left_out = frozenset(albums), 0
+    sample: Sequence[Path]
+    if like:
+        sample, left_out = photos_of(like, names)
+        calibration = albums
+        names |= {path.parent.name for path in sample if path.parent not in like}
+        if not sample:
+            raise CommandError("everybody in --like is in PEOPLE too; name folders of others")
+    else:
+        sample, calibration = split_people(albums)
+    others, more = photos_of(faces, names)
+    taken = {path.resolve() for path in (*labelled.paths, *sample)}
+    kept = tuple(path for path in others if path.resolve() not in taken)
+    if not kept:
+        raise CommandError("everybody in --faces is in PEOPLE or --like; name folders of others")
+    return Roles(kept, tuple(sample), calibration, left_out + more + len(others) - len(kept))
 
 
 def split_people(albums: Albums) -> tuple[tuple[Path, ...], Albums]:

@@ -1,0 +1,176 @@
+"""From embeddings of labelled people to a contract that carries its verdict.
+
+Axes and dimension are chosen, and privacy is judged, by attacks; so this lies above both
+``verify`` and ``attacks``. The commands ``calibrate`` and ``setup``, and the demo, call it.
+"""
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from attacks.operating_point import (
+    OperatingPoint,
+    choose_and_judge,
+    judge_accuracy,
+    judge_groups,
+)
+from attacks.privacy import AttackSetup
+from models.extraction import Extraction
+from models.pack import ModelPack
+from templates.contract.document import Contract
+from templates.contract.verdict import Verdict
+from templates.decoys import DecoyPool, DecoySource
+from templates.distances.blas import single_threaded
+from templates.space.lifting import Strategy, plain_strategy
+from verify import CalibrationOptions, CalibrationReport, LabelledFolder, calibrate, read_lfw_pairs
+from verify.calibration import part_of
+from verify.comparisons import Progress
+from verify.group_rates import PhotoLabels
+from verify.own_decoys import require_others
+from verify.preparation import PreparationError, binding_for, recorded_of
+from verify.trials import chosen_photos
+
+DEFAULT_PROBE_DIM = 4
+"""Dimension of the lifted probes that a calibration takes."""
+SEARCHED = 0.6
+"""Share of a calibration's time that has passed, on LFW, once axes and dimension are chosen."""
+
+
+def default_probe_dims(m: int | None) -> tuple[int, ...]:
+    """Dimensions of lifted probes where none are asked for: no larger than the templates'."""
+    return (DEFAULT_PROBE_DIM if m is None else min(DEFAULT_PROBE_DIM, m),)
+
+
+@dataclass(frozen=True)
+class CalibratedFolder:
+    """A contract with its verdict, the report of its calibration, and why it has its dimension."""
+
+    contract: Contract
+    report: CalibrationReport
+    point: OperatingPoint
+
+
+def calibrate_folder(
+    folder: LabelledFolder,
+    extraction: Extraction,
+    *,
+    pack: ModelPack,
+    source: DecoySource,
+    strategy: Strategy,
+    axes: int | None = None,
+    m: int | None = None,
+    options: CalibrationOptions,
+    exclude: Collection[str] = (),
+    aliases: Mapping[str, str] | None = None,
+    labels: PhotoLabels | None = None,
+    progress: Progress = lambda _what, _share: None,
+) -> CalibratedFolder:
+    """Calibrate on the descriptors of a labelled folder; judge privacy, accuracy and groups.
+
+    LFW's own pairs are used for the ten-fold protocol where ``pairs.txt`` lies in the folder.
+
+    Parameters
+    ----------
+    source
+        With all of its axes.
+    axes, m
+        Axes that embeddings are projected on, and dimension of the templates; None: what rejects
+        the fewest genuine probes of all that is private.
+    labels
+        Of the photos of ``extraction``, for rates by group of people.
+    progress
+        Called with what is being done and the share of the whole, which rises from 0 to 1.
+
+    Raises
+    ------
+    ContractError
+        The decoys were made of these people, or the data are too few for a single level.
+    PreparationError
+        The strategy has no decoys.
+    """
+    if not strategy.needs_decoys:
+        raise PreparationError(
+            f"templates of strategy {strategy} conceal nothing; `veilface evaluate` measures it, "
+            "and no contract is made for it"
+        )
+    name_of = dict(zip(folder.paths, folder.identities, strict=True))
+    pairs_file = folder.root / "pairs.txt"
+    pairs = None
+    if options.protocol == "ten-fold" and pairs_file.is_file():
+        missing = [failure.path for failure in extraction.failures]
+        pairs = read_lfw_pairs(pairs_file, extraction.paths, missing=missing)
+    names = [name_of[path] for path in extraction.paths]
+    kept, staying = chosen_photos(names, exclude=exclude, aliases=aliases or {})
+    if len(kept):
+        require_others(source, extraction.descriptors[kept], staying)
+    # Thousands of products of small matrices: with a second thread for each, the library spends
+    # most of its time waiting. The distances have threads of their own.
+    with single_threaded():
+        point = operating_point(
+            extraction.descriptors[kept],
+            staying,
+            source,
+            strategy=strategy,
+            axes=axes,
+            m=m,
+            options=options,
+            progress=part_of(progress, 0.0, SEARCHED),
+        )
+        source = source.reduced(point.axes)
+        probe_dims = tuple(dim for dim in options.probe_dims if dim <= point.dim)
+        done = calibrate(
+            extraction.descriptors,
+            names,
+            binding=binding_for(pack, source, strategy=strategy, m=point.dim),
+            source=source,
+            options=replace(options, probe_dims=probe_dims),
+            exclude=exclude,
+            aliases=aliases,
+            labels=labels,
+            pairs=pairs,
+            recorded=recorded_of(pack),
+            dataset=folder.root.resolve().name,
+            progress=part_of(progress, SEARCHED, 1.0),
+        )
+    accuracy = None
+    if len(set(staying)) < len(staying):
+        accuracy = judge_accuracy(
+            done.contract, photos=extraction.attempts, not_acquired=len(extraction.failures)
+        )
+    verdict = Verdict(point.privacy, accuracy, judge_groups(done.contract))
+    return CalibratedFolder(replace(done.contract, verdict=verdict), done.report, point)
+
+
+def operating_point(
+    descriptors: NDArray[np.float32],
+    names: Sequence[str],
+    source: DecoySource,
+    *,
+    strategy: Strategy,
+    axes: int | None,
+    m: int | None,
+    options: CalibrationOptions,
+    progress: Progress,
+) -> OperatingPoint:
+    """Choose what is not asked for, and judge how private it is."""
+    what = "attacking templates"
+    progress(what, 0.0)
+    setup = AttackSetup.of_people(
+        descriptors, names, source, photos=options.photos_per_enrollment, seed=options.seed
+    )
+    plain = plain_strategy(strategy)
+    uncovered = None
+    if isinstance(source, DecoyPool):
+        uncovered = "who has the pool finds the decoys, and no attack of a calibration has it"
+    elif plain is not strategy:
+        uncovered = f"the attacks are on {plain} lifting, not on what {strategy} chooses by"
+    return choose_and_judge(
+        setup,
+        strategy=strategy,
+        axes=axes,
+        m=m,
+        uncovered=uncovered,
+        progress=lambda share: progress(what, share),
+    )

@@ -1,1 +1,0 @@
-"""What calibration and setup do, before a service can start."""
