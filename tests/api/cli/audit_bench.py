@@ -7,15 +7,12 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from models.synthetic import draw_face, encode_photo
-from models.synthetic_people import draw_person
+from models.synthetic import draw_face, draw_person, encode_photo
 from verify.fairface_labels import RACES
 
 TRAIN, VALIDATION = 260, 60
 AGES = ("03-Sep", "20-29", "Oct-19", "more than 70")
 """Two of them as spreadsheets leave them."""
-BRIGHT = 480
-"""Sum of the skin's colours that parts the drawn people into two halves."""
 
 
 def write_photo(file: Path, identity: int, photo: int = 0) -> None:
@@ -25,8 +22,7 @@ def write_photo(file: Path, identity: int, photo: int = 0) -> None:
 
 def gender_of(identity: int) -> str:
     """A label that the picture shows, so that an attacker can learn it: light or dark skin."""
-    skin = draw_person(np.random.default_rng([identity, 0])).skin
-    return "Female" if sum(skin) > BRIGHT else "Male"
+    return "Female" if draw_person(identity).skin < 0.5 else "Male"
 
 
 def draw_fairface(root: Path, *, train: int = TRAIN, validation: int = VALIDATION) -> Path:
