@@ -1,8 +1,8 @@
-"""Descriptors that were computed elsewhere, and the photos of a set that they belong to."""
+"""Embeddings that were computed elsewhere, and the photos of a set that they belong to."""
 
 import hashlib
 from collections import Counter, defaultdict
-from collections.abc import Sequence, Set
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from verify.datasets import SUFFIXES, DatasetError, faults_in
-from verify.evaluation.readers.isolated import isolated
+from verify.evaluation.readers.reader import isolated
 from verify.evaluation.verification_set import VerificationSet
 
 _NAMES = ("paths", "descriptors")
@@ -119,24 +119,28 @@ def match(embeddings: EmbeddingsFile, benchmark: VerificationSet) -> NDArray[np.
     DatasetError
         Several rows fit a photo equally well, or one row fits several photos.
     """
-    exact = {path: row for row, path in enumerate(embeddings.paths)}
-    names = [_components(picture.name) for picture in benchmark.pictures]
-    ends = _Ends([_components(path) for path in embeddings.paths], {name[-1:] for name in names})
+    exact = {path: [row] for row, path in enumerate(embeddings.paths)}
+    ends: defaultdict[tuple[str, ...], list[int]] = defaultdict(list)
+    whole: defaultdict[tuple[str, ...], list[int]] = defaultdict(list)
+    for row, path in enumerate(embeddings.paths):
+        pieces = _components(path)
+        whole[pieces].append(row)
+        for start in range(len(pieces)):
+            ends[pieces[start:]].append(row)
     telling = _TELLING.get(benchmark.kind)
     positions = np.full(len(benchmark.pictures), -1, dtype=np.int64)
     takers: dict[int, str] = {}
     faults: list[str] = []
-    for place, (picture, wanted) in enumerate(zip(benchmark.pictures, names, strict=True)):
-        same = exact.get(picture.name)
-        rows = ends.longest(wanted, telling) if same is None else [same]
+    for place, picture in enumerate(benchmark.pictures):
+        name = picture.name
+        rows = exact.get(name) or _longest(_components(name), ends, whole, telling)
         if len(rows) > 1:
-            shown = " and ".join(f"{embeddings.paths[row]!a}" for row in rows)
-            faults.append(f"{picture.name} may be {shown}")
-        elif rows and rows[0] in takers:
+            shown = " and ".join(f"{embeddings.paths[row]!a}" for row in rows[:_SHOWN])
+            faults.append(f"{name} may be {shown}")
+        elif rows and takers.setdefault(rows[0], name) != name:
             path = embeddings.paths[rows[0]]
-            faults.append(f"{path!a} fits both {takers[rows[0]]} and {picture.name}")
+            faults.append(f"{path!a} fits both {takers[rows[0]]} and {name}")
         elif rows:
-            takers[rows[0]] = picture.name
             positions[place] = rows[0]
     if faults:
         raise DatasetError(
@@ -145,48 +149,19 @@ def match(embeddings: EmbeddingsFile, benchmark: VerificationSet) -> NDArray[np.
     return positions
 
 
-class _Ends:
-    """Ends of paths: each is numbered by the end one component shorter and its own first one.
+_Rows = Mapping[tuple[str, ...], list[int]]
 
-    Parameters
-    ----------
-    paths
-        Components of each path.
-    lasts
-        Last components that will be asked for; paths with others are left out.
-    """
 
-    def __init__(self, paths: Sequence[tuple[str, ...]], lasts: Set[tuple[str, ...]]) -> None:
-        self._number: dict[tuple[int, str], int] = {}
-        self._with: defaultdict[int, list[int]] = defaultdict(list)
-        self._whole: defaultdict[int, list[int]] = defaultdict(list)
-        for row, pieces in enumerate(paths):
-            if not pieces or pieces[-1:] not in lasts:
-                continue
-            end = 0
-            for piece in reversed(pieces):
-                end = self._number.setdefault((end, piece), len(self._number) + 1)
-                # Two would do to tell that an end is shared; a message shows three.
-                if len(self._with[end]) < _SHOWN:
-                    self._with[end].append(row)
-            if len(self._whole[end]) < _SHOWN:
-                self._whole[end].append(row)
-
-    def longest(self, wanted: tuple[str, ...], telling: int | None) -> list[int]:
-        """Rows that share the longest end with a path, three of them at most."""
-        best: list[int] = []
-        end = 0
-        for shared, piece in enumerate(reversed(wanted), start=1):
-            if (end, piece) not in self._number:
-                break
-            end = self._number[end, piece]
-            rows = self._whole.get(end, [])
-            if shared == len(wanted):
-                rows = rows or self._with[end]
-            elif telling is not None and shared >= telling:
-                rows = self._with[end]
-            best = rows or best
-        return best
+def _longest(wanted: tuple[str, ...], ends: _Rows, whole: _Rows, telling: int | None) -> list[int]:
+    """Rows that share the longest end with a path, of which that end is all, or enough to tell."""
+    for start in range(len(wanted)):
+        end = wanted[start:]
+        tells = telling is not None and len(end) >= telling
+        rows = whole.get(end) if start == 0 or not tells else None
+        rows = rows or (ends.get(end) if start == 0 or tells else None)
+        if rows:
+            return rows
+    return []
 
 
 def _components(path: str) -> tuple[str, ...]:

@@ -13,10 +13,10 @@ import scipy.io
 from tests.verify.evaluation.layouts import agedb_folder
 from verify.datasets import DatasetError
 from verify.evaluation.embeddings_file import read_embeddings
-from verify.evaluation.readers import isolated as module
 from verify.evaluation.readers import open_sets
+from verify.evaluation.readers import reader as module
 from verify.evaluation.readers.agedb import PROTOCOL
-from verify.evaluation.readers.isolated import isolated
+from verify.evaluation.readers.reader import isolated
 
 LONG = pytest.mark.long
 NAMED = b"c_codecs\nencode\nq\x000X"

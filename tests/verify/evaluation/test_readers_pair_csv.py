@@ -43,7 +43,7 @@ def test_pairs(tmp_path: Path) -> None:
     np.testing.assert_array_equal(mine.first, 0)
     np.testing.assert_array_equal(mine.second, [1, 2] * FOLDS)
     np.testing.assert_array_equal(mine.same, [True, False] * FOLDS)
-    np.testing.assert_array_equal(mine.folds, np.arange(2 * FOLDS) // 2)
+    assert mine.folds is None
     assert notes(mine) == ["Mine: 18 pairs compare the same two photos as another pair"]
 
 
@@ -102,7 +102,7 @@ def test_people(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (table(HEADER, "a,b,perhaps", OTHER), r"10 faults.*line 2 has neither 1/true/yes"),
+        (table(HEADER, "a,b,perhaps", OTHER), "line 2 has neither 1/true/yes"),
         (table(HEADER, "https://x.org/a.png,b,1", OTHER), "line 2 has a URL in path_a"),
         (table(HEADER, "a,file:///b,1", OTHER), "line 2 has a URL in path_b"),
         (table(HEADER, ",b,1", OTHER), "line 2 has no path in path_a"),
@@ -116,13 +116,27 @@ def test_people(tmp_path: Path) -> None:
         (table(HEADER, SAME, OTHER).replace(",", ";"), "save it with commas"),
         (HEADER, "holds no pair"),
         ("", "no column path_a"),
-        (table(HEADER, SAME, SAME), "fold 1 has no impostor pair"),
+        (table(HEADER, SAME, SAME), "has no pair of two people"),
         (table(HEADER, "x.png,y.png,1", OTHER), r"2 faults.*x.png is not there; y.png is"),
     ],
 )
 def test_faults_are_listed_by_line(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(DatasetError, match=message):
         read(tmp_path, text)
+
+
+def test_a_folder_is_a_template_of_its_photos(tmp_path: Path) -> None:
+    mine = read(tmp_path, f"{HEADER}\nphotos,photos/b1.png,1\nphotos/a1.png,photos,0\n")
+    assert [one.name for one in mine.pictures] == [
+        *("photos/a1.png", "photos/a2.png", "photos/b1.png"),
+        *("photos/b1.png", "photos/a1.png"),
+    ]
+    assert mine.templates == ((0, 1, 2), (3,), (4,))
+    assert mine.names == ["photos/a1.png", "photos/b1.png", "photos/a1.png"]
+    np.testing.assert_array_equal([mine.first, mine.second], [[0, 2], [1, 0]])
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(DatasetError, match="empty holds no photo"):
+        read(tmp_path, f"{HEADER}\nempty,photos/b1.png,1\nphotos/a1.png,photos,0\n")
 
 
 def test_photos_need_not_be_there(tmp_path: Path) -> None:

@@ -2,18 +2,17 @@
 
 import csv
 import re
-from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
 from templates.contract.liveness import SPECIES_NAME
-from verify.datasets import SUFFIXES, DatasetError, faults_in
-from verify.evaluation.readers.protocol_files import read_text
+from verify.datasets import DatasetError, is_photo, visible
+from verify.evaluation.readers.reader import read_text
 
 LIVE = "live"
 ATTACKS = "spoof"
-REQUIRED = ("path", "presentation")
-COLUMNS = (*REQUIRED, "subject")
+REQUIRED = {"path", "presentation"}
+COLUMNS = {*REQUIRED, "subject"}
 FOLDER = f"expected {LIVE}/ and {ATTACKS}/SPECIES/ with photos in them"
 TABLE = "expected path,presentation[,subject], where presentation is live or names the species"
 _NUMBERED = re.compile(r"([0-9]{2,})_")
@@ -76,126 +75,90 @@ def read_presentations(path: Path, *, attacks: bool) -> PresentationSet:
     Raises
     ------
     DatasetError
-        Listing every fault.
+        Naming the first fault.
     """
     try:
         if path.is_dir():
-            found = _folder(path)
+            presentations = _folder(path)
         elif path.is_file():
-            found = _csv(path)
+            presentations = _csv(path)
         else:
             raise DatasetError(f"{path} is not there; {FOLDER}, or a CSV: {TABLE}")
     except OSError as error:
         raise DatasetError(f"{path} cannot be read: {error.strerror}") from None
-    if not any(one.species is None for one in found):
+    if not any(one.species is None for one in presentations):
         raise DatasetError(f"{path} has no live photo, and BPCER is of live photos")
-    if attacks and all(one.species is None for one in found):
+    if attacks and all(one.species is None for one in presentations):
         raise DatasetError(f"{path} has no attack photo, and APCER is of attack photos")
-    ordered = sorted(found, key=lambda one: (one.species or "", one.name))
+    ordered = sorted(presentations, key=lambda one: (one.species or "", one.name))
     kind = "folder" if path.is_dir() else "csv"
     return PresentationSet(path.resolve().stem, kind, tuple(ordered))
 
 
 def _folder(root: Path) -> list[Presentation]:
-    faults: list[str] = []
-    species: dict[str | None, Path] = {}
-    for entry in _entries(root):
-        if entry.name == LIVE and entry.is_dir():
-            species[None] = entry
-        elif entry.name == ATTACKS and entry.is_dir():
-            for folder in _entries(entry):
-                if not folder.is_dir():
-                    if folder.suffix.lower() in SUFFIXES:
-                        faults.append(f"photo {ATTACKS}/{folder.name} lies in no species' folder")
-                elif SPECIES_NAME.fullmatch(folder.name) and folder.name != LIVE:
-                    species[folder.name] = folder
-                else:
-                    faults.append(f"{ATTACKS}/{folder.name!a} is no name of a species")
-        elif entry.is_dir() or entry.suffix.lower() in SUFFIXES:
-            faults.append(f"{entry.name} lies beside {LIVE}/ and {ATTACKS}/")
+    folders: dict[str | None, Path] = {None: root / LIVE}
+    attacks = root / ATTACKS
+    for folder in visible(attacks) if attacks.is_dir() else ():
+        if not SPECIES_NAME.fullmatch(folder.name) or folder.name == LIVE or is_photo(folder):
+            raise DatasetError(
+                f"{root}: {ATTACKS}/{folder.name!a} is no name of a species; {FOLDER}"
+            )
+        if folder.is_dir():
+            folders[folder.name] = folder
+    for entry in visible(root):
+        if entry.name not in (LIVE, ATTACKS) and (entry.is_dir() or is_photo(entry)):
+            raise DatasetError(f"{root}: {entry.name} lies beside {LIVE}/ and {ATTACKS}/; {FOLDER}")
     photos: list[tuple[str | None, Path]] = []
-    for name, folder in species.items():
-        inside = [
-            photo
-            for photo in sorted(folder.rglob("*"))
-            if photo.suffix.lower() in SUFFIXES
-            and photo.is_file()
-            and not any(part.startswith(".") for part in photo.relative_to(root).parts)
-        ]
+    for species, folder in folders.items():
+        inside = [photo for photo in sorted(folder.rglob("[!.]*")) if is_photo(photo)]
         if not inside:
-            faults.append(f"{folder.relative_to(root)} holds no photo")
-        photos += [(name, photo) for photo in inside]
-    if not species:
-        faults.append(f"there is no {LIVE}/ in it")
-    if faults:
-        raise DatasetError(faults_in(root, FOLDER, faults))
+            raise DatasetError(f"{root}: {folder.relative_to(root)} holds no photo; {FOLDER}")
+        photos += [(species, photo) for photo in inside]
     numbers = [_NUMBERED.match(photo.name) for _, photo in photos]
     numbered = all(numbers)
     return [
         Presentation(
             photo,
             photo.relative_to(root).as_posix(),
-            name,
+            species,
             number[1] if number is not None and numbered else None,
         )
-        for (name, photo), number in zip(photos, numbers, strict=True)
+        for (species, photo), number in zip(photos, numbers, strict=True)
     ]
-
-
-def _entries(folder: Path) -> list[Path]:
-    return sorted(entry for entry in folder.iterdir() if not entry.name.startswith("."))
 
 
 def _csv(file: Path) -> list[Presentation]:
     text = read_text(file, root=file.parent).text
     reader = csv.reader(text.splitlines(keepends=True), strict=True)
-    faults: list[str] = []
-    found: list[Presentation] = []
+    presentations: dict[str, Presentation] = {}
     try:
         header = [cell.strip().lower() for cell in next(reader, [])]
-        faults += [f"line 1 has no column {name}" for name in REQUIRED if name not in header]
-        faults += [
-            f"line 1 has the unknown column {name!a}" for name in header if name not in COLUMNS
-        ]
-        if len(set(header)) < len(header):
-            faults.append("line 1 names a column twice")
-        for cells in reader if not faults else ():
-            if not any(cell.strip() for cell in cells):
-                continue
-            if len(cells) != len(header):
-                faults.append(f"line {reader.line_num} has {len(cells)} cells, not {len(header)}")
-                continue
-            row = dict(zip(header, (cell.strip() for cell in cells), strict=True))
-            wrong = _faults_of(file, row)
-            if wrong:
-                faults.append(f"line {reader.line_num} {' and '.join(wrong)}")
-                continue
-            kind = row["presentation"]
-            found.append(
-                Presentation(
-                    file.parent / row["path"],
-                    row["path"],
-                    None if kind == LIVE else kind,
-                    row.get("subject") or None,
-                )
-            )
+        if not REQUIRED <= {*header} <= COLUMNS or len({*header}) < len(header):
+            raise DatasetError(f"{file}: line 1 has the columns {', '.join(header)!a}; {TABLE}")
+        for cells in reader:
+            if any(cell.strip() for cell in cells):
+                where = f"{file}: line {reader.line_num}"
+                if len(cells) != len(header):
+                    raise DatasetError(f"{where} has {len(cells)} cells, not {len(header)}")
+                row = dict(zip(header, (cell.strip() for cell in cells), strict=True))
+                if fault := _fault_of(file, row):
+                    raise DatasetError(f"{where} {fault}")
+                name, kind, subject = row["path"], row["presentation"], row.get("subject") or None
+                if name in presentations:
+                    raise DatasetError(f"{where}: {name} is named twice")
+                species = None if kind == LIVE else kind
+                presentations[name] = Presentation(file.parent / name, name, species, subject)
     except csv.Error as error:
-        faults.append(f"line {reader.line_num} is not CSV ({error})")
-    twice = [name for name, count in Counter(one.name for one in found).items() if count > 1]
-    faults += [f"{name} is named twice" for name in twice]
-    if faults:
-        raise DatasetError(faults_in(file, TABLE, faults))
-    return found
+        raise DatasetError(f"{file}: line {reader.line_num} is not CSV ({error})") from None
+    return list(presentations.values())
 
 
-def _faults_of(file: Path, row: dict[str, str]) -> list[str]:
-    wrong = []
+def _fault_of(file: Path, row: dict[str, str]) -> str | None:
     if not row["path"] or not row["path"].isprintable():
-        wrong.append("has no path")
-    elif not (file.parent / row["path"]).is_file():
-        wrong.append(f"names {row['path']}, which is not there")
+        return "has no path"
+    if not (file.parent / row["path"]).is_file():
+        return f"names {row['path']}, which is not there"
     if not SPECIES_NAME.fullmatch(row["presentation"]):
-        wrong.append("has neither live nor a species in presentation")
-    if not row.get("subject", "").isprintable():
-        wrong.append("has a subject that cannot be printed")
-    return wrong
+        return "has neither live nor a species in presentation"
+    printable = row.get("subject", "").isprintable()
+    return None if printable else "has a subject that cannot be printed"

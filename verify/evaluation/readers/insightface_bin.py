@@ -1,12 +1,14 @@
 """InsightFace's ``.bin``: a pickle of encoded photos and of the answers to their pairs."""
 
-from collections.abc import Sequence
+import io
+import pickle
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from verify.datasets import DatasetError, read_whole
-from verify.evaluation.readers.assembly import Trial, assemble
-from verify.evaluation.readers.isolated import isolated
-from verify.evaluation.readers.plain_pickle import PickledArray, RefusedPickle, read_pickle
+from verify.evaluation.readers.reader import Reader, Trial, assemble, isolated
 from verify.evaluation.verification_set import (
     PictureBytes,
     VerificationSet,
@@ -19,13 +21,13 @@ MAX_BIN_BYTES = 2 * 2**30
 _SIGNATURES = (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n")
 
 
-def read_bin(path: Path) -> VerificationSet:
+def read_bin(path: Path, _: bool) -> list[VerificationSet]:
     """Read ``(bins, issame_list)``; pair i is ``bins[2 i]`` and ``bins[2 i + 1]``.
 
     Elements are encoded JPEG or PNG, as bytes, as byte arrays, or as arrays of uint8 with one side
     that is not 1: ``cv2.imencode`` returned a column before OpenCV 4.5.1. Either part may be an
-    array of objects instead of a list. Photos are neither decoded nor counted twice: equal
-    contents are one photo, named by the place of its first use in ``bins``.
+    array of objects instead of a list. Equal contents are one photo, named by the place of its
+    first use in ``bins``.
 
     Raises
     ------
@@ -33,22 +35,25 @@ def read_bin(path: Path) -> VerificationSet:
         Naming what is wrong. Nothing in the file is run, whatever it holds.
     """
     photos, same, sha256 = isolated(read_content, path)
-    named, content_of = _named(photos)
+    name_of: dict[bytes, str] = {}
+    named = [name_of.setdefault(photo, f"{place:05d}") for place, photo in enumerate(photos)]
     trials = [
         Trial(named[2 * pair], named[2 * pair + 1], answer, int(fold))
         for pair, (answer, fold) in enumerate(
             zip(same, contiguous_folds(len(same)).tolist(), strict=True)
         )
     ]
-    return assemble(
-        path.stem.lower(),
-        "bin",
-        trials,
-        picture=lambda name: PictureBytes(name, content_of[name]),
-        person=None,
-        protocol_files=[(path.name, sha256)],
-        aligned=True,
-    )
+    return [
+        assemble(
+            path.stem.lower(),
+            "bin",
+            trials,
+            pictures={name: PictureBytes(name, photo) for photo, name in name_of.items()},
+            person=None,
+            protocol_files=[(path.name, sha256)],
+            aligned=True,
+        )
+    ]
 
 
 def read_content(path: Path) -> tuple[list[bytes], list[bool], str]:
@@ -60,71 +65,131 @@ def read_content(path: Path) -> tuple[list[bytes], list[bool], str]:
         As of :func:`read_bin`.
     """
     data = read_whole(path, most=MAX_BIN_BYTES)
+    stream = io.BytesIO(data)
     try:
-        content = read_pickle(data)
+        content = _Unpickler(stream, encoding="bytes").load()
+        if rest := len(data) - stream.tell():
+            raise pickle.UnpicklingError(f"{rest} bytes follow its end")
         if not isinstance(content, tuple | list) or len(content) != 2:
             raise DatasetError(f"{path} does not hold the two parts (bins, issame_list)")
-        bins, answers = map(_listed, content)
-    except RefusedPickle as error:
+        bins, answers = (part.values() if isinstance(part, _Array) else part for part in content)
+    except (DatasetError, MemoryError):
+        raise
+    except pickle.UnpicklingError as error:
         raise DatasetError(f"{path} is not a readable InsightFace .bin: {error}") from None
+    except Exception as error:  # a broken pickle raises whatever its instructions cause
+        raise DatasetError(f"{path} is cut off or damaged ({type(error).__name__})") from None
     if not isinstance(bins, tuple | list):
-        raise DatasetError(f"{path}: its first part, bins, is not a list of photos")
+        raise DatasetError(f"{path}: its first part, bins, is not a list")
     if not isinstance(answers, tuple | list):
         raise DatasetError(f"{path}: its second part, issame_list, is not a list")
-    if len(bins) % 2:
-        raise DatasetError(f"{path} has an odd number of photos, {len(bins)}; pairs need two each")
-    if len(bins) != 2 * len(answers):
+    if not answers or len(bins) != 2 * len(answers):
         raise DatasetError(
-            f"{path} has {len(bins)} photos and {len(answers)} answers; "
-            f"{len(answers)} pairs need {2 * len(answers)} photos"
+            f"{path} has {len(bins)} photos and {len(answers)} answers; a pair needs two photos"
         )
-    if not answers:
-        raise DatasetError(f"{path} holds no pair")
     for place, answer in enumerate(answers):
         if not isinstance(answer, int) or answer not in (0, 1):
             raise DatasetError(f"{path}: answer {place} is neither true nor false")
-    return _photos(path, bins), [bool(answer) for answer in answers], digest_of(data)
+    photos = [_photo(path, place, element) for place, element in enumerate(bins)]
+    return photos, [bool(answer) for answer in answers], digest_of(data)
 
 
-def _listed(part: object) -> object:
-    """Return the elements of an array: numbers, or objects as of ``np.array(…, dtype=object)``."""
-    if not isinstance(part, PickledArray):
-        return part
-    if isinstance(part.content, list):
-        return part.content
-    return part.type.numbers(part.content) if len(part.shape) == 1 else None
+def _photo(path: Path, place: int, element: object) -> bytes:
+    if isinstance(element, _Array):
+        element = element.row()
+    if not isinstance(element, bytes | bytearray):
+        raise DatasetError(f"{path}: photo {place} is neither bytes nor a row of uint8")
+    if not element.startswith(_SIGNATURES):
+        raise DatasetError(f"{path}: photo {place} is neither JPEG nor PNG")
+    return bytes(element)
 
 
-def _photos(path: Path, bins: Sequence[object]) -> list[bytes]:
-    photos: list[bytes] = []
-    for place, element in enumerate(bins):
-        if isinstance(element, PickledArray):
-            row = max(element.shape, default=0) == len(element.content)
-            if element.type.code != "u1" or not row:
-                raise DatasetError(f"{path}: photo {place} is an array, but not one row of uint8")
-            element = element.content
-        if not isinstance(element, bytes | bytearray):
-            raise DatasetError(f"{path}: photo {place} is neither bytes nor an array")
-        if not element.startswith(_SIGNATURES):
-            raise DatasetError(f"{path}: photo {place} is neither JPEG nor PNG")
-        # Bytes that are said again stay one object, here and on their way out of the process.
-        photos.append(element if isinstance(element, bytes) else bytes(element))
-    return photos
+def _text(value: Any) -> str:
+    """Return text, which is bytes where Python 2 wrote it."""
+    return str(value, "latin-1") if isinstance(value, bytes) else str(value)
 
 
-def _named(photos: list[bytes]) -> tuple[list[str], dict[str, bytes]]:
-    """Name every photo by the first place of its content; also return the contents by name.
+class _Type:
+    """Stands for ``numpy.dtype``."""
 
-    A pickle may say one photo a million times at two bytes each. Each object is looked up once,
-    so that its bytes are compared once and not each time that it is said.
-    """
-    names: dict[bytes, str] = {}
-    name_of_object: dict[int, str] = {}
-    named = []
-    for place, photo in enumerate(photos):
-        name = name_of_object.get(id(photo))
-        if name is None:
-            name = names.setdefault(photo, f"{place:05d}")
-            name_of_object[id(photo)] = name
-        named.append(name)
-    return named, {name: photo for photo, name in names.items()}
+    def __init__(self, code: Any, *_: object) -> None:
+        self.code = _text(code)
+
+    def __setstate__(self, state: Any) -> None:
+        self.code = _text(state[1]).replace("|", "") + self.code
+
+    def numbers(self, raw: bytes) -> list[Any]:
+        """Return the numbers of which these are the bytes."""
+        numbers: list[Any] = np.frombuffer(raw, self.code).tolist()
+        return numbers
+
+
+class _Array:
+    """Stands for an array: NumPy's own trusts the state that a pickle gives it."""
+
+    def __init__(self, *_: object) -> None:
+        self.state: Any = None
+
+    def __setstate__(self, state: Any) -> None:
+        self.state = state
+
+    def values(self) -> list[Any] | None:
+        """Return the elements of an array of one dimension."""
+        _, shape, kind, _, content = self.state
+        if len(shape) != 1 or isinstance(content, list):
+            return content if isinstance(content, list) else None
+        numbers: list[Any] = kind.numbers(content)
+        return numbers
+
+    def row(self) -> bytes | None:
+        """Return the bytes of a row, or a column, of uint8."""
+        _, shape, kind, _, content = self.state
+        is_row = kind.code == "u1" and max(shape, default=0) == len(content)
+        return content if is_row else None
+
+
+def _filled(raw: bytes, kind: _Type, shape: Any, _: Any) -> _Array:
+    array = _Array()
+    array.state = (1, shape, kind, False, raw)
+    return array
+
+
+def _encoded(text: str | bytes = b"", _: Any = "latin-1") -> bytes:
+    return text if isinstance(text, bytes) else text.encode("latin-1")
+
+
+_ALLOWED: dict[str, Any] = {
+    "numpy.ndarray": "ndarray",
+    "numpy.dtype": _Type,
+    "_codecs.encode": _encoded,
+    "builtins.bytearray": _encoded,
+    "__builtin__.bytearray": _encoded,
+}
+for _core in ("numpy.core", "numpy._core"):
+    _ALLOWED |= {
+        f"{_core}.multiarray._reconstruct": _Array,
+        f"{_core}.multiarray.scalar": lambda kind, raw: kind.numbers(raw)[0],
+        f"{_core}.numeric._frombuffer": _filled,
+    }
+
+
+class _Unpickler(pickle.Unpickler):
+    """Reads plain values; what a pickle names means what stands above, and nothing else."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        if f"{module}.{name}" not in _ALLOWED:
+            asked = f"{module}.{name}"[:100]
+            raise pickle.UnpicklingError(f"it asks for {asked!a}; nothing was run")
+        return _ALLOWED[f"{module}.{name}"]
+
+
+def _recognises(path: Path) -> bool:
+    if not path.is_file():
+        return False
+    with path.open("rb") as stream:
+        head = stream.read(2)
+    # Protocols 2 to 5 begin with their number; 0 and 1 are known by the suffix only.
+    return path.suffix.lower() == ".bin" or (head[:1] == b"\x80" and head[1:] in b"\2\3\4\5")
+
+
+READER = Reader("an InsightFace .bin file", _recognises, read_bin)

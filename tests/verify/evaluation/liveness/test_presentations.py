@@ -66,10 +66,10 @@ def test_attacks_are_asked_for_where_they_are_needed(tmp_path):
 @pytest.mark.parametrize(
     ("names", "said"),
     [
-        ([], "there is no live/"),
-        (["spoof/print/a.jpg"], "no live photo"),
+        ([], "live holds no photo"),
+        (["spoof/print/a.jpg"], "live holds no photo"),
         (["live/readme.txt", "spoof/print/a.jpg"], "live holds no photo"),
-        (["live/a.jpg", "spoof/a.jpg"], "spoof/a.jpg lies in no species' folder"),
+        (["live/a.jpg", "spoof/a.jpg"], "spoof/'a.jpg' is no name of a species"),
         (["live/a.jpg", "spoof/print/a.txt"], "spoof/print holds no photo"),
         (["live/a.jpg", "spoof/live/a.jpg"], "'live' is no name of a species"),
         (["live/a.jpg", "spoof/p|q/a.jpg"], "is no name of a species"),
@@ -87,8 +87,8 @@ def test_faults_of_a_folder_are_named(tmp_path, names, said):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("path,label\n", "no column presentation.*unknown column 'label'"),
-        ("path,path,presentation\n", "names a column twice"),
+        ("path,label\n", "has the columns 'path, label'"),
+        ("path,path,presentation\n", "has the columns 'path, path, presentation'"),
         ("path,presentation\na.jpg\n", "line 2 has 1 cells, not 2"),
         ("path,presentation\n,live\n", "line 2 has no path"),
         ("path,presentation\nz.jpg,live\n", "line 2 names z.jpg, which is not there"),

@@ -1,0 +1,252 @@
+"""What every reader of a benchmark is made of.
+
+A reader is a module of this package with a ``READER``: how a data set looks, how it is recognised,
+and a function from its path to verification sets. Modules are found by being there.
+"""
+
+import resource
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from verify.datasets import (
+    MAX_PAIRS_BYTES,
+    SUFFIXES,
+    DatasetError,
+    decoded,
+    faults_in,
+    is_photo,
+    read_whole,
+)
+from verify.evaluation.verification_set import (
+    Picture,
+    VerificationSet,
+    digest_of,
+    require_both_classes,
+)
+
+T = TypeVar("T")
+MEMORY_BYTES = 8 * 2**30
+"""Four times the largest file that is read, beyond what the libraries of the process take."""
+
+_LONGEST_NAME = 100
+# A spreadsheet runs a cell that begins so; Markdown, tables and figures have meanings for the rest.
+_FORMULAS = ("=", "+", "-", "@")
+_MARKUP = frozenset("[]$|`")
+
+
+@dataclass(frozen=True)
+class Reader:
+    """How one kind of data set is read.
+
+    Parameters
+    ----------
+    layout
+        For the message that says what is understood.
+    recognises
+        Whether a path, which is there, holds such a set.
+    read
+        Gives the sets at a path. ``pictures`` says whether the photos themselves must be there;
+        they need not be where embeddings were computed elsewhere.
+    """
+
+    layout: str
+    recognises: Callable[[Path], bool]
+    read: Callable[[Path, bool], list[VerificationSet]]
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One comparison of a protocol; photos by a key that is unique in the set."""
+
+    first: str
+    second: str
+    same: bool
+    fold: int | None = None
+
+
+@dataclass(frozen=True)
+class ProtocolText:
+    """Text of a file with its name relative to the set, and the SHA-256 of its bytes."""
+
+    name: str
+    sha256: str
+    text: str
+
+    @property
+    def fingerprint(self) -> tuple[str, str]:
+        """Name and SHA-256, as ``VerificationSet.protocol_files`` lists them."""
+        return self.name, self.sha256
+
+
+def read_text(file: Path, *, root: Path) -> ProtocolText:
+    """Read UTF-8 text, with or without a byte-order mark.
+
+    Raises
+    ------
+    DatasetError
+        The file is absent, too large or not UTF-8.
+    """
+    data = read_whole(file, most=MAX_PAIRS_BYTES)
+    name = file.relative_to(root).as_posix()
+    return ProtocolText(name, digest_of(data), decoded(data, file=file))
+
+
+def isolated(read: Callable[[Path], T], file: Path) -> T:
+    """Read a file of a format that can ask for any memory, in a process that gets little.
+
+    Raises
+    ------
+    DatasetError
+        That of ``read``; or the process ran out of memory, or crashed.
+    """
+    with ProcessPoolExecutor(
+        1, get_context("spawn"), initializer=_limit_memory, initargs=(MEMORY_BYTES,)
+    ) as child:
+        try:
+            return child.submit(read, file).result()
+        except (BrokenProcessPool, MemoryError):
+            raise DatasetError(
+                f"{file} is not readable: its reader crashed, or needed more than "
+                f"{MEMORY_BYTES // 2**20} MiB of memory"
+            ) from None
+
+
+def _limit_memory(most: int) -> None:
+    pages = Path("/proc/self/statm")
+    if pages.exists():
+        taken = int(pages.read_text().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (taken + most, resource.RLIM_INFINITY))
+
+
+def keys_of(trials: Iterable[Trial]) -> list[str]:
+    """Keys of the photos, each once, in the order of their first use."""
+    return list(dict.fromkeys(key for trial in trials for key in (trial.first, trial.second)))
+
+
+def photos_named(base: Path, keys: Sequence[str], *, protocol: str) -> dict[str, Path]:
+    """Find the one photo of each key, which is its path below ``base`` without the suffix.
+
+    Raises
+    ------
+    DatasetError
+        Listing the photos that are absent, or there with several suffixes.
+    """
+    listed: dict[Path, dict[str, list[Path]]] = {}
+    photos: dict[str, Path] = {}
+    faults: list[str] = []
+    for key in keys:
+        folder, stem = (base / key).parent, Path(key).name
+        if folder not in listed:
+            listed[folder] = {}
+            for file in sorted(folder.iterdir()) if folder.is_dir() else ():
+                if is_photo(file):
+                    listed[folder].setdefault(file.stem, []).append(file)
+        match listed[folder].get(stem, []):
+            case [photo]:
+                photos[key] = photo
+            case []:
+                faults.append(f"{key} is not there")
+            case several:
+                faults.append(f"{key} is there {len(several)} times with different suffixes")
+    if faults:
+        suffixes = ", ".join(sorted(SUFFIXES))
+        raise DatasetError(
+            faults_in(base, f"expected the photos that {protocol} names ({suffixes})", faults)
+        )
+    return photos
+
+
+def require_plain_names(file: Path, names: Iterable[str]) -> None:
+    """Refuse names that lead out of the folder of the photos.
+
+    Raises
+    ------
+    DatasetError
+        Listing them.
+    """
+    unsafe = sorted(
+        f"{name!a}"
+        for name in set(names)
+        if not name.isprintable() or "/" in name or "\\" in name or name in (".", "..")
+    )
+    if unsafe:
+        raise DatasetError(faults_in(file, "expected plain names", unsafe))
+
+
+def assemble(
+    name: str,
+    kind: str,
+    trials: Sequence[Trial],
+    *,
+    pictures: Mapping[str, Picture] | Callable[[str], Picture],
+    person: Callable[[str], str] | None,
+    protocol_files: Iterable[tuple[str, str]],
+    aligned: bool | None = None,
+    templates: Mapping[str, Sequence[Picture]] | None = None,
+) -> VerificationSet:
+    """Number the photos of ``trials`` and check that every fold has both kinds of pairs.
+
+    Parameters
+    ----------
+    pictures, person
+        The photo of a key, and the name of the person on it.
+    templates
+        Photos of the keys that stand for several.
+
+    Raises
+    ------
+    DatasetError
+        A fold lacks genuine or impostor pairs, or a name cannot stand in tables and figures.
+    """
+    protocol_files = tuple(protocol_files)
+    _require_plain(name, [file for file, _ in protocol_files])
+    keys = keys_of(trials)
+    position = {key: place for place, key in enumerate(keys)}
+    same = np.array([trial.same for trial in trials], dtype=np.bool_)
+    folds = None
+    if trials and trials[0].fold is not None:
+        folds = np.array([trial.fold for trial in trials], dtype=np.int64)
+    require_both_classes(name, same, folds)
+    of_key = pictures if callable(pictures) else pictures.__getitem__
+    photos: list[Picture] = []
+    members: list[tuple[int, ...]] = []
+    for key in keys:
+        own = (templates or {}).get(key) or [of_key(key)]
+        members.append(tuple(range(len(photos), len(photos) + len(own))))
+        photos += own
+    return VerificationSet(
+        name=name,
+        kind=kind,
+        pictures=tuple(photos),
+        first=np.array([position[trial.first] for trial in trials], dtype=np.int64),
+        second=np.array([position[trial.second] for trial in trials], dtype=np.int64),
+        same=same,
+        folds=folds,
+        people=None if person is None else tuple(person(key) for key in keys),
+        protocol_files=protocol_files,
+        aligned=aligned,
+        templates=tuple(members) if templates else None,
+    )
+
+
+def _require_plain(name: str, files: Sequence[str]) -> None:
+    """Refuse a name that would mean something in CSV, Markdown, a figure or the terminal."""
+    # What is printable can be encoded: halves of surrogate pairs are not.
+    wrong = next((text for text in (name, *files) if not text.isprintable()), None)
+    if wrong is None and (
+        len(name) > _LONGEST_NAME or name.startswith(_FORMULAS) or _MARKUP & set(name)
+    ):
+        wrong = name
+    if wrong is not None:
+        raise DatasetError(
+            f"the set {wrong[:_LONGEST_NAME]!a} has a name that is longer than {_LONGEST_NAME} "
+            f"characters, not printable, begins with one of {' '.join(_FORMULAS)}, or holds one of "
+            f"{' '.join(sorted(_MARKUP))}; rename the file"
+        )
