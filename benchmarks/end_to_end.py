@@ -149,12 +149,14 @@ def enroll_photos(
     attributes: dict[str, str] | None,
     *,
     face: str = FacePolicy.DOMINANT,
+    holder_key: str | None = None,
 ) -> httpx.Response:
     """PUT the person's enrollment photos."""
+    fields = {"face": face} | ({"attributes": json.dumps(attributes)} if attributes else {})
     return client.put(
         f"/v1/subjects/{person.name}/enrollment",
         files=[("images", (p.name, p.read_bytes(), "image/jpeg")) for p in person.enroll],
-        data={"face": face} | ({"attributes": json.dumps(attributes)} if attributes else {}),
+        data=fields | ({} if holder_key is None else {"holder_key": holder_key}),
     )
 
 

@@ -8,7 +8,13 @@ from verify.calibration_mode import CalibrationOptions
 from verify.challenge import MAX_FRAMES, MIN_FRAMES, Movement, draw_movements
 from verify.datasets import DatasetError, LabelledFolder, labelled_folder, read_lfw_pairs
 from verify.decision import Decision
-from verify.photo_probe import MAX_PROBE_PHOTOS, PhotoProbe
+from verify.photo_probe import (
+    MAX_PROBE_PHOTOS,
+    PhotoProbe,
+    probe_of_embeddings,
+    probe_of_frames,
+    probe_of_photos,
+)
 from verify.stand_ins import StandIn
 from verify.verifier import OpenedTemplate, Verifier
 
@@ -30,5 +36,8 @@ __all__ = [
     "calibrate",
     "draw_movements",
     "labelled_folder",
+    "probe_of_embeddings",
+    "probe_of_frames",
+    "probe_of_photos",
     "read_lfw_pairs",
 ]

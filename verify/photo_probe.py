@@ -18,6 +18,7 @@ from models.selection import FacePolicy
 from templates.contract.document import Contract
 from templates.errors import Uncalibrated
 from templates.space.agreement import InconsistentImages, distinct_rows, mean_embedding
+from templates.space.embedding import unit_rows
 from verify.challenge import (
     LivenessFailure,
     Movement,
@@ -93,6 +94,21 @@ def probe_of_photos(
     failure = passive_failure(contract, scores) if passive else None
     clear = all(pack.is_clear(sample.quality) for sample in distinct)
     return PhotoProbe(mean, len(distinct), failure, clear)
+
+
+def probe_of_embeddings(contract: Contract, embeddings: NDArray[np.floating]) -> PhotoProbe:
+    """Average 1 to 5 unit embeddings of one person, (k, n), that a client made of photos.
+
+    Raises
+    ------
+    InvalidEmbedding
+        Where an embedding is not a finite unit vector of n numbers.
+    InconsistentImages
+        Where they are not of one person.
+    """
+    rows = unit_rows(embeddings, n=contract.binding.n, most=MAX_PROBE_PHOTOS)
+    mean = mean_embedding(rows, consistency=contract.probe_consistency)
+    return PhotoProbe(mean, len(distinct_rows(rows)), failure=None, clear=True)
 
 
 def probe_of_frames(

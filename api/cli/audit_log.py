@@ -15,7 +15,7 @@ from api.cli.options import STORE, takes_settings
 from api.cli.public_key import PublicKey, read_public_key
 from api.cli.results import Result, reports
 from api.http.audit import operator
-from api.http.values import iso_time
+from api.http.schemas import iso_time
 from api.service.opening import checked_store
 from api.settings import Settings
 from templates.store import TemplateStore

@@ -25,7 +25,7 @@ from api.http.audit import note_refusal
 from api.http.context import RequestContext
 from api.http.cors import Cors
 from api.http.deps import refuse_unknown
-from api.http.errors import ApiError, StartError, api_error, wrong_values
+from api.http.errors import ApiError, StartError, api_error, wrong_value
 from api.http.openapi import DescribedApi, allowed_methods, describe, operation_id
 from api.http.protocol import Protocol
 from api.http.routes import (
@@ -315,4 +315,4 @@ async def _framework_error(request: Request, error: Exception) -> Response:
 
 async def _validation_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)  # noqa: S101 - registered for this type
-    return await _known_error(request, wrong_values(error.errors()))
+    return await _known_error(request, wrong_value(error.errors()[0]))

@@ -15,8 +15,6 @@ from templates.errors import StoreError
 from templates.store.audit_log import By, Entry
 
 ACTIONS = {
-    "enroll": "enroll",
-    "verify": "verify",
     "erase_subject": "erase",
     "export_subject": "export",
     "get_audit_log": "audit-log",
@@ -24,7 +22,8 @@ ACTIONS = {
     "import_subject": "import",
     "unlock_subject": "unlock",
 }
-"""Routes whose refusals are written, by the name of their function, and the action of each."""
+"""Actions of routes, by the name of their function, where they are called otherwise than it. All
+others have its name, with hyphens."""
 
 UNWRITTEN = frozenset(
     {"rate_limited", "overloaded", "store_unavailable", "model_unavailable", "internal_error"}
@@ -50,14 +49,13 @@ async def note_refusal(request: Request, error: ApiError, cause: Exception) -> N
     `cause` is what was raised; the store marks what it has written itself (``recorded``).
     """
     fields = request.state.log
-    route = request.scope.get("route")
-    action = ACTIONS.get(getattr(route, "name", ""))
-    if action is None or "key_id" not in fields or error.code in UNWRITTEN:
+    route = getattr(request.scope.get("route"), "name", None)
+    if route is None or "key_id" not in fields or error.code in UNWRITTEN:
         return
     if getattr(cause, "recorded", False):
         return
     entry = Entry(
-        action,
+        ACTIONS.get(route, route.replace("_", "-")),
         error.code,
         by(request),
         tenant=fields.get("tenant"),

@@ -8,12 +8,11 @@ from fastapi import Depends, Request, Security
 from fastapi.security import APIKeyHeader, HTTPAuthorizationCredentials, HTTPBearer
 
 from api.http.errors import ApiError
-from api.http.tokens import USES, SubjectToken, opened_token, prefix_of
+from api.http.tokens import SubjectToken, opened_token, prefix_of
 from api.limits.admission import Gate
 from api.limits.rates import RateLimits
 from api.service.runtime import Runtime
 from templates.keys.api_token import is_token
-from templates.store.api_keys import ApiKey
 
 _bearer = HTTPBearer(
     auto_error=False, scheme_name="bearer", description="`Authorization: Bearer vf_…`, or `vft_…`"
@@ -46,12 +45,6 @@ class Caller:
     lowest_level: str | None = None
     subject_token: SubjectToken | None = None
 
-    @property
-    def name(self) -> str:
-        """What it is counted by."""
-        token = self.subject_token
-        return self.prefix if token is None else f"{self.prefix}:{token.token_id}"
-
     def require(self, *rights: str) -> None:
         """Refuse unless the key has all of these rights.
 
@@ -69,6 +62,11 @@ class Caller:
             )
 
     @property
+    def sees_scores(self) -> bool:
+        """Whether the key may see distances, and why liveness failed."""
+        return {"scores", "enroll"} <= self.rights
+
+    @property
     def sees_enrollment(self) -> bool:
         """Whether the key may learn that a subject does not exist."""
         return bool(self.rights & {"enroll", "admin"})
@@ -79,7 +77,7 @@ async def caller(
     bearer: Annotated[HTTPAuthorizationCredentials | None, Security(_bearer)] = None,
     header: Annotated[str | None, Security(_header)] = None,
 ) -> Caller:
-    """Recognise the API key of a request.
+    """Recognise the API key of a request, or a token, which counts for the key that made it.
 
     Raises
     ------
@@ -91,82 +89,66 @@ async def caller(
     """
     runtime: Runtime = request.app.state.runtime
     gate: Gate = request.app.state.gate
-    token = bearer.credentials if bearer is not None else header
-    refused = ApiError(
+    text = bearer.credentials if bearer is not None else header
+    # What is neither a key nor a token costs no query.
+    if text is None or not (is_token(text) or prefix_of(text)):
+        raise _unauthorized()
+    known = await gate.query(lambda: _recognised(runtime, text))
+    if known is None:
+        raise _unauthorized()
+    request.state.log.update(tenant=known.tenant, key_id=known.prefix)
+    token = known.subject_token
+    if token is not None:
+        request.state.log["token_id"] = token.token_id
+        note_subject(request, known, token.subject)
+        # Before it counts: who finds an old token shall not use up the rate of its key.
+        token.require_in_time()
+    rate_limits: RateLimits = request.app.state.rate_limits
+    await rate_limits.count_key(known.prefix)
+    if token is not None:
+        token.require(request.scope["route"].name, request.path_params.get("subject_id"))
+        await gate.query(lambda: runtime.store.audit_log.require_unused(token.digest))
+    return known
+
+
+def _unauthorized() -> ApiError:
+    return ApiError(
         "unauthorized",
         "send a valid API key or token: Authorization: Bearer vf_… or X-API-Key",
         {},
         {"WWW-Authenticate": "Bearer"},
     )
-    if token is None:
-        raise refused
-    api_key, subject_token = await _recognised(runtime, gate, token)
-    if api_key is None:
-        raise refused
-    rights = frozenset(map(str, api_key.rights))
-    if subject_token is not None:
-        rights &= {subject_token.action, "embeddings"}
-    known = Caller(
-        prefix=api_key.prefix,
-        tenant=api_key.tenant,
-        key_id=api_key.id,
-        rights=rights,
-        lowest_level=api_key.lowest_level,
-        subject_token=subject_token,
-    )
-    request.state.log.update(tenant=known.tenant, key_id=known.prefix)
-    rate_limits: RateLimits = request.app.state.rate_limits
-    await rate_limits.count_key(known.prefix)
-    if subject_token is not None:
-        await _require_token(request, runtime, gate, known, subject_token)
-    return known
 
 
-async def _recognised(
-    runtime: Runtime, gate: Gate, token: str
-) -> tuple[ApiKey | None, SubjectToken | None]:
-    """Look up an API key, or that of a token; what is neither costs no query."""
-    if is_token(token):
-        return await gate.query(lambda: runtime.store.api_keys.verify(token)), None
-    prefix = prefix_of(token)
+def _recognised(runtime: Runtime, text: str) -> Caller | None:
+    """Look up an API key, or that of a token."""
+    prefix, token = prefix_of(text), None
     if prefix is None:
-        return None, None
-    return await gate.query(lambda: _of_token(runtime, token, prefix))
+        key = runtime.store.api_keys.verify(text)
+    else:
+        key = runtime.store.api_keys.valid(prefix)
+        token = None if key is None else opened_token(runtime.keyring, text, key_id=key.id)
+        if key is None or token is None:
+            return None
+        if not token.late:
+            runtime.store.api_keys.note_use(key)
+    if key is None:
+        return None
+    rights = frozenset(map(str, key.rights))
+    return Caller(
+        prefix=key.prefix,
+        tenant=key.tenant,
+        key_id=key.id,
+        rights=rights if token is None else rights & {token.action, "embeddings"},
+        lowest_level=key.lowest_level,
+        subject_token=token,
+    )
 
 
-def _of_token(
-    runtime: Runtime, token: str, prefix: str
-) -> tuple[ApiKey, SubjectToken] | tuple[None, None]:
-    """Open a token; the use of its key is noted for no other text under the key's prefix."""
-    api_keys = runtime.store.api_keys
-    api_key = api_keys.valid(prefix)
-    if api_key is None:
-        return None, None
-    subject_token = opened_token(runtime.keyring, token, key_id=api_key.id)
-    if subject_token is None:
-        return None, None
-    if not subject_token.late:
-        api_keys.note_use(api_key)
-    return api_key, subject_token
-
-
-async def _require_token(
-    request: Request, runtime: Runtime, gate: Gate, caller: Caller, token: SubjectToken
-) -> None:
-    """Refuse a call that a token is not for, or that comes too late for it."""
-    request.state.log["token_id"] = token.token_id
-    pseudonym = runtime.store.signer.pseudonym(caller.tenant, token.subject)
-    note_subject(request, pseudonym)
-    token.require_in_time()
-    route = request.scope["route"].name
-    token.require(route, request.path_params.get("subject_id"))
-    if route not in USES:
-        # Those look for themselves, in the transaction that uses it up too.
-        await gate.query(lambda: runtime.store.audit_log.require_unused(token.digest))
-
-
-def note_subject(request: Request, pseudonym: str) -> None:
+def note_subject(request: Request, caller: Caller, subject: str) -> None:
     """Keep the subject's pseudonym for the audit log, and its beginning for the request's line."""
+    runtime: Runtime = request.app.state.runtime
+    pseudonym = runtime.store.signer.pseudonym(caller.tenant, subject)
     request.state.pseudonym = pseudonym
     request.state.log["subject"] = pseudonym[:16]
 

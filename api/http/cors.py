@@ -19,7 +19,6 @@ REQUEST_HEADERS = (
     "Content-Type",
     "If-Match",
     "If-None-Match",
-    "Veilface-Holder-Key",
     "X-API-Key",
     "X-Request-ID",
 )

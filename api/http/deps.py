@@ -1,17 +1,19 @@
 """Dependencies of the routes, as annotated aliases."""
 
-from functools import partial
-from typing import Annotated
+import re
+from typing import Annotated, Any
 from urllib.parse import parse_qsl
 
-from fastapi import Depends, Path, Query, Request
+from fastapi import Depends, Header, Path, Query, Request
 from pydantic import BeforeValidator
 
 from api.http.auth import Caller, CallerDep, holding, note_subject
-from api.http.errors import ApiError
+from api.http.errors import ApiError, refuse_unknown_names
 from api.limits.admission import Gate
 from api.service.runtime import Runtime
+from models.demo import DEMO_NOTICE
 from templates.store.identifiers import SUBJECT_ID_RULE, checked_subject_id
+from templates.store.subjects import Precondition
 
 
 async def runtime_of(request: Request) -> Runtime:
@@ -26,6 +28,12 @@ async def gate_of(request: Request) -> Gate:
     return gate
 
 
+async def common_of(request: Request) -> dict[str, Any]:
+    """Return what every answer says: the request's id, and with the demo model a notice."""
+    demo = request.app.state.settings.demo
+    return {"request_id": request.state.request_id, "notice": DEMO_NOTICE if demo else None}
+
+
 async def subject_of(
     request: Request,
     caller: CallerDep,
@@ -33,17 +41,14 @@ async def subject_of(
         str, Path(description=f"Subject id: has {SUBJECT_ID_RULE}.", examples=["alice"])
     ],
 ) -> str:
-    """Check the subject id, and note its pseudonym for the log.
+    """Check the subject id, and note its pseudonym for the logs.
 
     Raises
     ------
     InvalidIdentifier
         If it breaks the rule.
     """
-    runtime: Runtime = request.app.state.runtime
-    note_subject(
-        request, runtime.store.signer.pseudonym(caller.tenant, checked_subject_id(subject_id))
-    )
+    note_subject(request, caller, checked_subject_id(subject_id))
     return subject_id
 
 
@@ -65,9 +70,7 @@ async def enrolls_or_verifies(caller: CallerDep) -> Caller:
 
 
 async def refuse_unknown(request: Request) -> None:
-    """Refuse what the call does not read: a misspelt name must not pass as the default.
-
-    Every route has it. Fields of bodies are refused where they are read.
+    """Refuse what the route does not read. Fields of bodies are refused where they are read.
 
     Raises
     ------
@@ -76,38 +79,102 @@ async def refuse_unknown(request: Request) -> None:
         or that is not ``name=value`` in UTF-8; or a body where the call takes none.
     """
     known = [field.alias for field in request.scope["route"].dependant.query_params]
+    query = request.scope["query_string"]
     try:
-        query = request.scope["query_string"].decode("ascii")
-        names = [name for name, _ in _pairs(query)] if query else []
+        pairs = parse_qsl(
+            query.decode("ascii"),
+            keep_blank_values=True,
+            strict_parsing=bool(query),
+            errors="strict",
+        )
     except ValueError:
         raise ApiError("validation_failed", "the query is not name=value pairs in UTF-8") from None
-    if not set(names) <= set(known) or len(set(names)) < len(names):
-        raise ApiError(
-            "validation_failed",
-            "unknown or repeated query parameter; known are: " + (", ".join(known) or "none"),
-            {"known": known},
-        )
+    names = [name for name, _ in pairs]
+    refuse_unknown_names(names, known, "query parameter")
+    if len(set(names)) < len(names):
+        raise ApiError("validation_failed", "a query parameter comes twice")
     headers = request.headers
     sent = headers.get("content-length", "0") != "0" or "transfer-encoding" in headers
     if sent and request.method in ("GET", "DELETE"):
         raise ApiError("validation_failed", "this call takes no body: send it without one")
 
 
-_pairs = partial(parse_qsl, keep_blank_values=True, strict_parsing=True, errors="strict")
+_ETAG = re.compile(r'"([A-Za-z0-9_-]{1,64})"')
+
+
+async def precondition_of(
+    request: Request,
+    if_none_match: Annotated[
+        str | None, Header(description="`*`: never replace an enrollment.", examples=["*"])
+    ] = None,
+    if_match: Annotated[
+        str | None,
+        Header(
+            description="The `ETag` of an enrollment, which is its template id in quotation marks: "
+            "replace this enrollment only.",
+            examples=['"6f1d3c5f0d9b4a7f8e2b1a0c9d8e7f60"'],
+        ),
+    ] = None,
+) -> Precondition | None:
+    """Return what the subject must have for a write; None where the request does not say.
+
+    Raises
+    ------
+    ApiError
+        ``validation_failed`` for any other use of the two headers.
+    """
+    sent = request.headers.getlist("If-None-Match") + request.headers.getlist("If-Match")
+    if not sent:
+        return None
+    if len(sent) == 1 and if_none_match is not None and if_none_match.strip() == "*":
+        return Precondition(None)
+    named = _ETAG.fullmatch((if_match or "").strip())
+    if len(sent) > 1 or named is None:
+        raise _precondition_refused(
+            "send one of the two, once: If-None-Match: * never replaces an enrollment, "
+            'If-Match: "…" replaces the one with this ETag'
+        )
+    return Precondition(named[1])
+
+
+async def refuse_precondition(request: Request) -> None:
+    """Refuse the two headers where nothing heeds them: the write would happen regardless.
+
+    Raises
+    ------
+    ApiError
+        ``validation_failed``.
+    """
+    if "If-None-Match" in request.headers or "If-Match" in request.headers:
+        raise _precondition_refused("this call takes neither: send it without them")
+
+
+def _precondition_refused(message: str) -> ApiError:
+    field = "If-Match, If-None-Match"
+    return ApiError("validation_failed", f"{field}: {message}", {"field": field})
+
+
+def etag(template_id: str) -> str:
+    """Return the entity tag of an enrollment."""
+    return f'"{template_id}"'
 
 
 def _digits(value: str | int) -> str | int:
     if isinstance(value, str) and not (value.isascii() and value.isdigit()):
-        raise ValueError("not a whole number")
+        raise ValueError("has a wrong value: it must be a whole number")
     return value
 
 
 Limit = Annotated[
     int, BeforeValidator(_digits), Query(ge=1, le=1000, description="Entries on one page, at most.")
 ]
+Cursor = Annotated[str | None, Query(description="`next_cursor` of the page before.")]
 RuntimeDep = Annotated[Runtime, Depends(runtime_of)]
 GateDep = Annotated[Gate, Depends(gate_of)]
+Common = Annotated[dict[str, Any], Depends(common_of)]
 SubjectDep = Annotated[str, Depends(subject_of)]
+PreconditionDep = Annotated[Precondition | None, Depends(precondition_of)]
+NoPreconditionDep = Annotated[None, Depends(refuse_precondition)]
 Enrolls = Annotated[Caller, Depends(holding("enroll"))]
 EnrollsOrVerifies = Annotated[Caller, Depends(enrolls_or_verifies)]
 Verifies = Annotated[Caller, Depends(holding("verify"))]

@@ -6,7 +6,7 @@ An error body has one shape, framework errors included::
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -206,33 +206,54 @@ _TABLE: tuple[tuple[type[Exception], str, str | None], ...] = (
 )
 
 
-_BOUNDS = {
+_WORDS = {
     "ge": "must be at least {}",
     "le": "must be at most {}",
     "min_length": "must have a length of at least {}",
     "max_length": "must have a length of at most {}",
+    "expected": "must be {}",
 }
 
 
-def wrong_values(problems: Sequence[Mapping[str, Any]]) -> ApiError:
-    """Name the parameters that the framework refused: the first in words, all in details.
-
-    Only their names and bounds are told: the input is not repeated.
+def wrong_value(problem: Mapping[str, Any], remedy: str = "") -> ApiError:
+    """Name the parameter or field that pydantic refused, and its bounds; never what was sent.
 
     Parameters
     ----------
-    problems
-        Of pydantic: each with ``loc``, ``type`` and perhaps the bounds in ``ctx``.
+    problem
+        Of pydantic: ``loc``, ``type`` and perhaps ``ctx``. An error that a validator of ours
+        raised is passed on: its text repeats no value.
     """
-    told = [
-        {"field": ".".join(map(str, problem["loc"][1:])), "problem": problem["type"]}
-        for problem in problems
-    ]
-    bounds = problems[0].get("ctx", {})
-    said = [words.format(bounds[name]) for name, words in _BOUNDS.items() if name in bounds]
-    wrong = f"has a wrong value ({told[0]['problem'].replace('_', ' ')})"
-    message = f"the parameter {told[0]['field']} {' and '.join(said) or wrong}"
-    return ApiError("validation_failed", message, {"problems": told})
+    name = str(problem["loc"][-1]) if problem["loc"] else None
+    bounds = problem.get("ctx", {})
+    said = [words.format(bounds[bound]) for bound, words in _WORDS.items() if bound in bounds]
+    if problem["type"] == "value_error":
+        said = [str(bounds["error"])]
+    elif problem["type"] == "missing":
+        said = ["must be there"]
+    said = said or [f"has a wrong value ({problem['type'].replace('_', ' ')})"]
+    message = " ".join(filter(None, (name, " and ".join(said)))) + remedy
+    return ApiError("validation_failed", message, {} if name is None else {"field": name})
+
+
+def refuse_unknown_names(
+    sent: Iterable[str], known: Collection[str], what: str, remedy: str = ""
+) -> None:
+    """Refuse names that a call does not read: a misspelt `level` must not pass as the default.
+
+    This is the one rule for query parameters, form fields and JSON keys.
+
+    Raises
+    ------
+    ApiError
+        ``validation_failed``; it lists the known names, and ends as `remedy` says.
+    """
+    if not set(sent) <= set(known):
+        raise ApiError(
+            "validation_failed",
+            f"unknown {what}; known are: {', '.join(sorted(known)) or 'none'}{remedy}",
+            {"known": sorted(known)},
+        )
 
 
 def plain_details(details: Mapping[str, Any]) -> dict[str, Any]:

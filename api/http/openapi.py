@@ -7,19 +7,11 @@ from typing import Any
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 from fastapi.routing import APIRoute
+from pydantic import BaseModel
 from starlette.routing import BaseRoute
 
 from api.http.errors import ERROR_CODES
-from api.http.schemas import (
-    HOLDER_KEY,
-    REQUEST_ID,
-    ErrorAnswer,
-    TemplateRequest,
-    VerifyRequest,
-)
-from api.http.tokens import ACTIONS, LONGEST_S
-from templates.keys.holder_key import PATTERN as HOLDER_KEY_PATTERN
-from verify import MAX_FRAMES, MAX_PROBE_PHOTOS
+from api.http.schemas import REQUEST_ID, ErrorAnswer
 
 DESCRIPTION = """\
 Face authentication that never stores a face embedding. Every error has one shape; the codes are
@@ -105,153 +97,17 @@ def error_responses(*codes: str) -> dict[int | str, dict[str, Any]]:
     return grouped
 
 
-def _text(description: str, **extra: Any) -> dict[str, Any]:
-    return {"type": "string", "description": description, **extra}
-
-
-LEVEL = _text(
-    "Security level; default from the contract, or the lowest allowed.", examples=["fmr-1e-3"]
-)
-FACE = _text(
-    "Which face counts when a photo shows several: the largest if it covers the middle of the "
-    "picture and has twice the area of every other (`dominant`, the default); the largest wherever "
-    "it is (`largest`), if it has 1.25 times the area; none (`single`). Otherwise the photo is "
-    "refused as `multiple_faces`.",
-    enum=["dominant", "largest", "single"],
-)
-HOLDER_KEY_FIELD = _text(
-    "The holder's key: 32 random bytes, base64url.",
-    pattern=HOLDER_KEY_PATTERN,
-    examples=[HOLDER_KEY],
-)
-FILE = {"type": "string", "format": "binary"}
-
-
-def _body(multipart: dict[str, Any] | None, json_body: dict[str, Any]) -> dict[str, Any]:
-    content: dict[str, Any] = {"application/json": json_body}
-    if multipart is not None:
-        content = {"multipart/form-data": {"schema": multipart}, **content}
-    return {"requestBody": {"required": True, "content": content}}
-
-
-ENROLLMENT_BODY = _body(
-    {
-        "type": "object",
-        "required": ["images"],
-        "properties": {
-            "images": {"type": "array", "items": FILE, "minItems": 1, "maxItems": 10},
-            "attributes": _text(
-                "JSON object with `gender` and `race`; used for lifting only, never stored.",
-                examples=['{"gender": "Female", "race": "Indian"}'],
-            ),
-            "face": FACE,
-            "holder_key": HOLDER_KEY_FIELD,
-        },
-    },
-    {
-        "schema": TemplateRequest.model_json_schema(),
-        "examples": {"template": {"value": {"template": "kAAAAAAAAAB7Li4u"}}},
-    },
-)
-PROBE_PHOTOS = {"type": "array", "items": FILE, "minItems": 1, "maxItems": MAX_PROBE_PHOTOS}
-CHALLENGE_ID = _text(
-    "`challenge_id` of POST /v1/challenges: the images are then the 5 to 12 frames that answer it.",
-    maxLength=1024,
-)
-FRAMES = {**PROBE_PHOTOS, "maxItems": MAX_FRAMES}
-CHALLENGE_BODY = _body(
-    None,
-    {
-        "schema": {
-            "type": "object",
-            "properties": {
-                "subject_id": {
-                    "anyOf": [{"type": "string"}, {"type": "null"}],
-                    "description": "The only subject that it may be answered for; left out: any.",
-                    "examples": ["alice"],
-                }
-            },
-        },
-        "examples": {"subject": {"value": {"subject_id": "alice"}}},
-    },
-)
-TOKEN_BODY = _body(
-    None,
-    {
-        "schema": {
-            "type": "object",
-            "required": ["subject_id", "action"],
-            "properties": {
-                "subject_id": {"type": "string", "examples": ["alice"]},
-                "action": {"type": "string", "enum": list(ACTIONS)},
-                "level": {
-                    "anyOf": [{"type": "string"}, {"type": "null"}],
-                    "description": "For `verify`; left out, the one in force.",
-                    "examples": ["fmr-1e-3"],
-                },
-                "lifetime_s": {
-                    "type": "integer",
-                    "minimum": 1,
-                    "maximum": LONGEST_S,
-                    "default": LONGEST_S,
-                },
-                "replace": {
-                    "type": "boolean",
-                    "default": True,
-                    "description": "For `enroll`; false: as `If-None-Match: *`.",
-                },
-            },
-        },
-        "examples": {"verify": {"value": {"subject_id": "alice", "action": "verify"}}},
-    },
-)
-VERIFY_BODY = _body(
-    {
-        "type": "object",
-        "oneOf": [{"required": ["image"]}, {"required": ["images"]}],
-        "properties": {
-            "image": PROBE_PHOTOS,
-            "images": FRAMES,
-            "challenge_id": CHALLENGE_ID,
-            "level": LEVEL,
-            "face": FACE,
-            "holder_key": HOLDER_KEY_FIELD,
-        },
-    },
-    {
-        "schema": VerifyRequest.model_json_schema(),
-        "examples": {
-            "embedding": {"value": {"embedding": [0.6, -0.8], "level": "fmr-1e-3"}},
-            "embeddings": {"value": {"embeddings": [[0.6, -0.8], [0.8, -0.6]]}},
-            "template": {"value": {"template": "kAAAAAAAAAB7Li4u"}},
-        },
-    },
-)
-CHECK_BODY = {
-    "requestBody": {
-        "required": True,
-        "content": {
-            "multipart/form-data": {
-                "schema": {
-                    "type": "object",
-                    "required": ["image"],
-                    "properties": {"image": FILE, "face": FACE},
-                }
-            }
-        },
+def body_of(
+    *, form: type[BaseModel] | None = None, json: type[BaseModel] | None = None
+) -> dict[str, Any]:
+    """Document a body by its models: FastAPI cannot say that a call takes two content types."""
+    models = {"multipart/form-data": form, "application/json": json}
+    content = {
+        kind: {"schema": model.model_json_schema()}
+        for kind, model in models.items()
+        if model is not None
     }
-}
-IMPORT_BODY = _body(
-    None,
-    {
-        "schema": {
-            "type": "object",
-            "required": ["export"],
-            "properties": {"export": _text("`export` of an export call.")},
-        },
-        "examples": {"import": {"value": {"export": "VkZYMS4uLg=="}}},
-    },
-)
+    return {"requestBody": {"required": True, "content": content}}
 
 
 def allowed_methods(document: Mapping[str, Any], path: str) -> list[str]:

@@ -1,18 +1,33 @@
-"""Shapes of the answers and of the JSON requests, for OpenAPI and for the tests.
+"""What the calls answer: FastAPI writes these models as JSON, and OpenAPI describes them."""
 
-Routes build plain dictionaries; a test holds every answer against these models.
-"""
+from datetime import UTC, datetime
+from typing import Annotated, Any, Literal
 
-from typing import Any, Literal
+from pydantic import BaseModel, ConfigDict, Field, PlainSerializer
 
-from pydantic import BaseModel, ConfigDict, Field
-
-from templates.keys.holder_key import PATTERN as HOLDER_KEY_PATTERN
-from verify import MAX_PROBE_PHOTOS
+from templates.store.api_keys import Right
+from verify import Movement
+from verify.challenge import LivenessFailure
 
 HEX = "9f86d081884c7d659a2feaa0c55ad015a3bf4f1b2b0b822cd15d6c15b0f00a08"
 REQUEST_ID = "4b1f0d5c8f1e4c54a52b3c9f7e2d6a10"
-HOLDER_KEY = "AAECAwQFBgcICQoLDA0ODxAREhMUFRYXGBkaGxwdHh8"
+
+
+def iso_time(value: datetime) -> str:
+    """Write a time in UTC to the second, as ``2026-01-31T12:00:00Z``."""
+    return value.astimezone(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
+
+
+def _is_none(value: object) -> bool:
+    return value is None
+
+
+Time = Annotated[
+    datetime,
+    PlainSerializer(iso_time, return_type=str),
+    Field(examples=["2026-01-31T12:00:00Z"]),
+]
+"""In UTC, to the second."""
 
 
 class _Shape(BaseModel):
@@ -21,7 +36,7 @@ class _Shape(BaseModel):
 
 class _Answer(_Shape):
     request_id: str = Field(description="Also in X-Request-ID.", examples=[REQUEST_ID])
-    notice: str | None = Field(None, description="Only with the demo model.")
+    notice: str | None = Field(None, description="Only with the demo model.", exclude_if=_is_none)
 
 
 class ErrorBody(_Shape):
@@ -57,40 +72,6 @@ class EnrollmentAnswer(_Answer):
     images: list[Photo] = Field(description="One for each photo; empty for a template.")
 
 
-class TemplateRequest(_Shape):
-    """A private template that a client lifted."""
-
-    template: str = Field(description="Base64 of the wire bytes.")
-    holder_key: str | None = Field(
-        None,
-        pattern=HOLDER_KEY_PATTERN,
-        description="The holder's key: 32 random bytes, base64url.",
-        examples=[HOLDER_KEY],
-    )
-
-
-class VerifyRequest(_Shape):
-    """A probe that is not a photo: exactly one of embedding, embeddings and template."""
-
-    embedding: list[float] | None = Field(None, description="Unit-norm, of the contract's n.")
-    embeddings: list[list[float]] | None = Field(
-        None,
-        min_length=1,
-        max_length=MAX_PROBE_PHOTOS,
-        description="Such embeddings of one person, which are averaged.",
-    )
-    template: str | None = Field(None, description="Base64 of a lifted probe's wire bytes.")
-    level: str | None = Field(
-        None, description="Security level; default from the contract, or the lowest allowed."
-    )
-    holder_key: str | None = Field(
-        None,
-        pattern=HOLDER_KEY_PATTERN,
-        description="The holder's key, where the enrollment needs one.",
-        examples=[HOLDER_KEY],
-    )
-
-
 class VerifyAnswer(_Answer):
     """The decision."""
 
@@ -103,23 +84,19 @@ class VerifyAnswer(_Answer):
     fmr: float = Field(description="False match rate of the level.", examples=[0.001])
     contract_id: str = Field(examples=[HEX])
     calibration_id: str = Field(examples=[HEX])
-    distance: float | None = Field(None, description="Only for keys with `scores` and `enroll`.")
-    liveness_failure: (
-        Literal[
-            "not_frontal",
-            "jump",
-            "no_turn",
-            "missing_movement",
-            "wrong_order",
-            "another_person",
-            "passive",
-        ]
-        | None
-    ) = Field(None, description="Why liveness failed: only for keys with `scores` and `enroll`.")
+    distance: float | None = Field(
+        None, description="Only for keys with `scores` and `enroll`.", exclude_if=_is_none
+    )
+    liveness_failure: LivenessFailure | None = Field(
+        None,
+        description="Why liveness failed: only for keys with `scores` and `enroll`.",
+        exclude_if=_is_none,
+    )
     advice: str | None = Field(
         None,
         description="What to change in another photo, after `no_match`: by the photo alone, "
         "whether the subject is enrolled or not.",
+        exclude_if=_is_none,
     )
 
 
@@ -127,15 +104,13 @@ class ChallengeAnswer(_Answer):
     """Movements to make, and the id that their frames are sent with."""
 
     challenge_id: str
-    movements: list[Literal["turn_left", "turn_right", "look_up", "look_down", "come_closer"]] = (
-        Field(
-            description="In this order, as the person sees them who makes them.",
-            examples=[["turn_left", "look_up", "come_closer"]],
-        )
+    movements: list[Movement] = Field(
+        description="In this order, as the person sees them who makes them.",
+        examples=[["turn_left", "look_up", "come_closer"]],
     )
     min_frames: int = Field(examples=[5])
     max_frames: int = Field(examples=[12])
-    expires_at: str = Field(examples=["2026-01-31T12:01:00Z"])
+    expires_at: Time
 
 
 class TokenAnswer(_Answer):
@@ -155,7 +130,7 @@ class TokenAnswer(_Answer):
         description="The only level that it verifies at; null for an enrollment.",
         examples=["fmr-1e-3"],
     )
-    expires_at: str = Field(examples=["2026-01-31T12:02:00Z"])
+    expires_at: Time
 
 
 class TokenOutcomeAnswer(_Answer):
@@ -169,14 +144,14 @@ class TokenOutcomeAnswer(_Answer):
         description="Null where it was not used."
     )
     level: str | None = Field(description="Of a verification that used it.", examples=["fmr-1e-3"])
-    used_at: str | None = Field(examples=["2026-01-31T12:00:21Z"])
+    used_at: Time | None
 
 
 class PackFileEntry(_Shape):
     """One graph of the pack."""
 
     role: Literal["detector", "embedder"]
-    kind: Literal["scrfd", "yunet"] | None = Field(description="Of a detector.")
+    kind: str | None = Field(description="Of a detector.", examples=["scrfd", "yunet"])
     file: str = Field(examples=["w600k_mbf.onnx"])
     sha256: str = Field(examples=[HEX])
     bytes: int = Field(examples=[13616099])
@@ -203,8 +178,8 @@ class Subject(_Shape):
     enrolled_by: Literal["photos", "template"]
     photos: int = Field(description="Photos that were averaged; 0 for a template.")
     holder_key: bool = Field(description="It accepts nobody without the holder's key.")
-    created_at: str = Field(examples=["2026-01-31T12:00:00Z"])
-    updated_at: str = Field(examples=["2026-01-31T12:00:00Z"])
+    created_at: Time
+    updated_at: Time
 
 
 class SubjectAnswer(Subject, _Answer):
@@ -221,7 +196,7 @@ class SubjectsAnswer(_Answer):
 class AuditLine(_Shape):
     """One line of the audit log: who did what to which subject, and with which result."""
 
-    at: str = Field(examples=["2026-01-31T12:00:00Z"])
+    at: Time
     actor: str = Field(description="Of a request, its key.", examples=["key:0f3a5c7e9b1d"])
     action: str = Field(examples=["verify"])
     subject: str | None = Field(description="Pseudonym of the subject.", examples=[HEX])
@@ -241,9 +216,9 @@ class LockoutAnswer(_Answer):
     """Failed verifications of a subject, enrolled or not."""
 
     consecutive_failures: int = Field(description="Since the last accept, or the last reset.")
-    last_failed_at: str | None = Field(examples=["2026-01-31T12:00:00Z"])
-    locked_until: str | None = Field(description="No attempt is decided before; null: open.")
-    disabled_at: str | None = Field(description="Since when it waits for an operator.")
+    last_failed_at: Time | None
+    locked_until: Time | None = Field(description="No attempt is decided before; null: open.")
+    disabled_at: Time | None = Field(description="Since when it waits for an operator.")
 
 
 class UnlockAnswer(_Answer):
@@ -338,9 +313,10 @@ class ContractAnswer(_Answer):
         "measured."
     )
     liveness: dict[str, Any] | None = Field(
-        default=None,
+        None,
         description="The liveness threshold with its graphs and error rates (docs/liveness.md); "
         "absent where there is none.",
+        exclude_if=_is_none,
     )
     photos: bool = Field(description="The service runs with a model pack.")
     generator: bool = Field(description="GET /v1/contract/generator has a generator to give.")
@@ -355,7 +331,7 @@ class KeyAnswer(_Answer):
 
     prefix: str = Field(description="How lists and logs name the key.", examples=["0f3a5c7e9b1d"])
     tenant: str = Field(examples=["default"])
-    rights: list[Literal["enroll", "verify", "erase", "export", "scores", "embeddings", "admin"]]
+    rights: list[Right]
     levels: list[str] = Field(
         description="Security levels that it may ask for; not those below the lowest that the "
         "deployment or the key allows.",
@@ -364,7 +340,7 @@ class KeyAnswer(_Answer):
     liveness: Literal["off", "passive", "active", "both"] = Field(
         description="What every verification must pass (docs/liveness.md)."
     )
-    expires_at: str | None = Field(examples=["2026-01-31T12:00:00Z"])
+    expires_at: Time | None
     demo: bool = Field(description="The service runs with the demo model.")
 
 

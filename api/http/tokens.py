@@ -7,15 +7,14 @@ the same transaction.
 
 import base64
 import binascii
-import json
 import secrets
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
-from typing import Literal, get_args
+from typing import Literal, TypeVar
 
-from api.http.bodies import parse_json
+from pydantic import BaseModel, ConfigDict, ValidationError
+
 from api.http.errors import ApiError
-from api.http.values import in_time
 from templates.errors import SealError
 from templates.keys.api_token import SUBJECT_TOKEN
 from templates.keys.sealing import MasterKeyring
@@ -24,26 +23,70 @@ from templates.store.lockout import Replayed
 from templates.store.subjects import Precondition
 
 Action = Literal["verify", "enroll"]
-ACTIONS: tuple[Action, ...] = get_args(Action)
-LONGEST_S = 120
 _PURPOSE = "subject-token"
 
 CALLS: dict[str, frozenset[Action]] = {
     "enroll": frozenset({"enroll"}),
     "verify": frozenset({"verify"}),
     "create_challenge": frozenset({"verify"}),
-    "get_contract": frozenset(ACTIONS),
-    "get_generator": frozenset(ACTIONS),
-    "list_pack": frozenset(ACTIONS),
-    "get_pack_file": frozenset(ACTIONS),
+    "get_contract": frozenset({"verify", "enroll"}),
+    "get_generator": frozenset({"verify", "enroll"}),
+    "list_pack": frozenset({"verify", "enroll"}),
+    "get_pack_file": frozenset({"verify", "enroll"}),
 }
 """Routes that take a token, by the name of their function, and of which action. No other does."""
-USES = frozenset(ACTIONS)
-"""Those of them that use it up."""
 
 
-@dataclass(frozen=True)
-class SubjectToken:
+class Sealed(BaseModel):
+    """What travels as a sealed text, to come back once, in time."""
+
+    model_config = ConfigDict(frozen=True)
+
+    expires_at: datetime
+
+    def sealed(self, keyring: MasterKeyring, purpose: str, bound_to: Sequence[str]) -> str:
+        """Return it as base64url, without padding."""
+        text = keyring.seal(self.model_dump_json().encode(), purpose=purpose, bound_to=bound_to)
+        return base64.urlsafe_b64encode(text).rstrip(b"=").decode("ascii")
+
+    @property
+    def late(self) -> bool:
+        """Whether its time is over."""
+        return self.expires_at < datetime.now(UTC)
+
+    def require_in_time(self) -> None:
+        """Refuse what is late.
+
+        Raises
+        ------
+        Replayed
+            Without a line in the audit log: anybody who finds an old token could write there for
+            ever.
+        """
+        if self.late:
+            raise Replayed("it has expired: ask for another one", recorded=True)
+
+
+S = TypeVar("S", bound=Sealed)
+
+
+def opened(
+    kind: type[S], text: str, keyring: MasterKeyring, purpose: str, bound_to: Sequence[str]
+) -> S | None:
+    """Open what :meth:`Sealed.sealed` wrote, in time or not; None for any other text."""
+    try:
+        sealed = base64.b64decode(text + "=" * (-len(text) % 4), b"-_", validate=True)
+        return kind.model_validate_json(keyring.open(sealed, purpose=purpose, bound_to=bound_to))
+    except (SealError, binascii.Error, ValidationError, ValueError):
+        return None
+
+
+def ends_in(seconds: int) -> datetime:
+    """Return the time in so many seconds, to the second."""
+    return datetime.now(UTC).replace(microsecond=0) + timedelta(seconds=seconds)
+
+
+class SubjectToken(Sealed):
     """What a token is good for.
 
     Attributes
@@ -54,8 +97,8 @@ class SubjectToken:
         Security level of a verification; None for an enrollment.
     token_id
         Names it in logs and answers; nothing can be done with it alone.
-    key_prefix, expires_at
-        Of the API key that asked for it, and when it ends.
+    key_prefix
+        Of the API key that asked for it.
     replace
         Whether its enrollment may replace an earlier one.
     """
@@ -65,33 +108,12 @@ class SubjectToken:
     level: str | None
     token_id: str
     key_prefix: str
-    expires_at: datetime
     replace: bool = True
 
     @property
     def digest(self) -> str:
         """What the audit log keeps of its use."""
         return token_digest(self.key_prefix, self.token_id)
-
-    @property
-    def late(self) -> bool:
-        """Whether its time is over, or has not come."""
-        return not in_time(self.expires_at, timedelta(seconds=LONGEST_S))
-
-    def require_in_time(self) -> None:
-        """Refuse a token that is late.
-
-        Raises
-        ------
-        Replayed
-            Without a line in the audit log: whoever finds an old token could write there for ever.
-        """
-        if self.late:
-            raise Replayed(
-                "the token has expired, or the service's clock was set back: ask your server for "
-                "another one",
-                recorded=True,
-            )
 
     def require(self, route: str, subject: str | None) -> None:
         """Refuse a call that the token is not for; `subject` is the one that the path names.
@@ -103,26 +125,16 @@ class SubjectToken:
         """
         if self.action not in CALLS.get(route, ()):
             raise _another("call", f"this token is good to {self.action}, and not for this call")
-        self.require_subject(subject)
-
-    def require_subject(self, subject: str | None) -> None:
-        """Refuse another subject than the token's; None is none.
-
-        Raises
-        ------
-        ApiError
-            ``forbidden``.
-        """
         if subject not in (None, self.subject):
             raise _another("subject", "this token is for another subject")
 
     def level_of(self, asked: str | None) -> str | None:
-        """Return the level to decide at, where a request asks for one or for none.
+        """Return the level to decide at.
 
         Raises
         ------
         ApiError
-            ``forbidden``.
+            ``forbidden`` where the request asks for another one.
         """
         if asked not in (None, self.level):
             raise _another(
@@ -131,12 +143,12 @@ class SubjectToken:
         return self.level
 
     def precondition(self, asked: Precondition | None) -> Precondition | None:
-        """Return what the subject must have for an enrollment, where a request asks for something.
+        """Return what the subject must have for an enrollment.
 
         Raises
         ------
         ApiError
-            ``forbidden``.
+            ``forbidden`` where the request may replace one, and the token may not.
         """
         if self.replace:
             return asked
@@ -149,14 +161,6 @@ def _another(what: str, message: str) -> ApiError:
     return ApiError("forbidden", message, {"token": what})
 
 
-@dataclass(frozen=True)
-class NewToken:
-    """A token that was just made; its text is shown once."""
-
-    token: SubjectToken
-    text: str = field(repr=False)
-
-
 def new_token(
     keyring: MasterKeyring,
     *,
@@ -167,32 +171,25 @@ def new_token(
     level: str | None,
     lifetime_s: int,
     replace: bool = True,
-) -> NewToken:
-    """Make a token.
+) -> tuple[SubjectToken, str]:
+    """Make a token; return it with its text, which is shown once.
 
     Parameters
     ----------
     key_id, key_prefix
         Row id and prefix of the API key that asks for it. The id is in the database alone, so that
         the master key does not suffice to make a token.
-    lifetime_s
-        1 to ``LONGEST_S``.
     """
-    expires = datetime.now(UTC).replace(microsecond=0) + timedelta(seconds=lifetime_s)
     token = SubjectToken(
-        subject, action, level, secrets.token_urlsafe(18), key_prefix, expires, replace
+        subject=subject,
+        action=action,
+        level=level,
+        token_id=secrets.token_urlsafe(18),
+        key_prefix=key_prefix,
+        expires_at=ends_in(lifetime_s),
+        replace=replace,
     )
-    body = {
-        "subject": subject,
-        "action": action,
-        "level": level,
-        "replace": replace,
-        "id": token.token_id,
-        "expires": int(expires.timestamp()),
-    }
-    sealed = keyring.seal(json.dumps(body).encode(), purpose=_PURPOSE, bound_to=[key_id])
-    text = base64.urlsafe_b64encode(sealed).rstrip(b"=").decode("ascii")
-    return NewToken(token, f"vft_{key_prefix}_{text}")
+    return token, f"vft_{key_prefix}_{token.sealed(keyring, _PURPOSE, [key_id])}"
 
 
 def prefix_of(text: str) -> str | None:
@@ -204,19 +201,4 @@ def prefix_of(text: str) -> str | None:
 def opened_token(keyring: MasterKeyring, text: str, *, key_id: str) -> SubjectToken | None:
     """Open a token that the API key of this row asked for, in time or not; None for any other."""
     match = SUBJECT_TOKEN.fullmatch(text)
-    if match is None:
-        return None
-    try:
-        sealed = base64.b64decode(match[2] + "=" * (-len(match[2]) % 4), b"-_", validate=True)
-        body = parse_json(keyring.open(sealed, purpose=_PURPOSE, bound_to=[key_id]))
-    except (SealError, binascii.Error, ValueError):
-        return None
-    return SubjectToken(
-        subject=body["subject"],
-        action=body["action"],
-        level=body["level"],
-        token_id=body["id"],
-        key_prefix=match[1],
-        expires_at=datetime.fromtimestamp(body["expires"], UTC),
-        replace=body["replace"],
-    )
+    return None if match is None else opened(SubjectToken, match[2], keyring, _PURPOSE, [key_id])

@@ -15,8 +15,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from api.http.errors import ApiError
-from api.http.levels import Levels
-from api.http.liveness import LivenessRules
+from api.http.policy import Levels, LivenessRules
 from api.http.transfer import Exported, ExportKey, seal_export
 from api.service.opening import (
     file_sealer,

@@ -223,10 +223,14 @@ def body(folder: Path) -> Target:
 
     from api.http.bodies import read_form, read_json
     from api.http.errors import ApiError
+    from api.http.requests import VerifyForm, VerifyJson
+    from api.settings import load_settings
+    from templates.errors import TemplateError
     from tests.fuzz import regressions
     from tests.fuzz.bodies import Bodies
 
     runner = asyncio.Runner()
+    settings = load_settings(body_timeout_s=60)
 
     def run(reading: Coroutine[Any, Any, Any]) -> Any:
         try:
@@ -247,14 +251,12 @@ def body(folder: Path) -> Target:
         headers = [(b"content-type", kind)]
         request = Request({"type": "http", "method": "POST", "headers": headers}, receive)
         if kind == b"application/json":
-            reading = read_json(request, max_bytes=64 * MIB, timeout_s=60)
-            demand(isinstance(run(reading), dict), "an object")
+            run(read_json(request, settings, VerifyJson))
         else:
-            limits: dict[str, Any] = {"max_images": 5, "max_image_bytes": 10 * MIB}
-            form = run(read_form(request, max_bytes=64 * MIB, timeout_s=60, **limits))
-            demand(len(form.files) <= 5 and len(form.fields) <= 16, "no more parts than the limit")
+            form = run(read_form(request, settings, VerifyForm, photos="image", most=5))
+            demand(1 <= len(form.photos) <= 5, "no more photos than the limit")
 
-    return Target(read, (ApiError,), Bodies().make, 64, regressions.bodies())
+    return Target(read, (ApiError, TemplateError), Bodies().make, 64, regressions.bodies())
 
 
 TARGETS: dict[str, Callable[[Path], Target]] = {

@@ -13,7 +13,8 @@ import httpx
 import numpy as np
 from numpy.typing import NDArray
 
-from api.http.tokens import LONGEST_S, new_token
+from api.http.requests import LONGEST_S
+from api.http.tokens import new_token
 from api.service.runtime import open_keyring, open_store
 from models.pack import ModelPack
 from tests.api.deployment import Deployment, bearer, images, photo
@@ -148,7 +149,7 @@ class Tokens:
 
     def once(self, subject: str) -> str:
         """Make a token as ``POST /v1/tokens`` does, without a request: for one verification."""
-        return new_token(
+        _, text = new_token(
             self._keyring,
             key_id=self._key.id,
             key_prefix=self._key.prefix,
@@ -156,7 +157,8 @@ class Tokens:
             action="verify",
             level=None,
             lifetime_s=LONGEST_S,
-        ).text
+        )
+        return text
 
 
 class Clients:

@@ -1,17 +1,13 @@
 """The audit log of a tenant, for operators' desks."""
 
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Query, Request
-from starlette.responses import Response
 
-from api.http.answers import answer
 from api.http.auth import note_subject
-from api.http.deps import Administers, GateDep, Limit, RuntimeDep
+from api.http.deps import Administers, Common, Cursor, GateDep, Limit, RuntimeDep
 from api.http.openapi import EVERY_CALL, error_responses
-from api.http.schemas import AuditLogAnswer
-from api.http.values import iso_time
-from templates.store.audit_log import Line
+from api.http.schemas import AuditLine, AuditLogAnswer
 from templates.store.cursors import close_cursor, open_cursor
 from templates.store.identifiers import checked_subject_id
 
@@ -22,7 +18,6 @@ _CURSOR_PURPOSE = "audit-log-cursor"
 
 @router.get(
     "",
-    response_model=AuditLogAnswer,
     responses=error_responses(*EVERY_CALL, "forbidden", "validation_failed"),
     summary="The tenant's audit log, page by page",
 )
@@ -31,49 +26,46 @@ async def get_audit_log(
     caller: Administers,
     runtime: RuntimeDep,
     gate: GateDep,
+    common: Common,
     limit: Limit = 100,
-    cursor: Annotated[str | None, Query(description="`next_cursor` of the page before.")] = None,
+    cursor: Cursor = None,
     subject_id: Annotated[str | None, Query(description="Only lines on this subject.")] = None,
-) -> Response:
+) -> AuditLogAnswer:
     """Right: `admin`. The latest line first; subjects are named by their pseudonyms.
 
     Whether a line was altered, removed or moved takes the whole log to see, and
     `veilface audit-log verify`.
     """
-    store, tenant = runtime.store, caller.tenant
-    pseudonym = None
+    store, keyring, tenant = runtime.store, runtime.keyring, caller.tenant
     if subject_id is not None:
-        pseudonym = store.signer.pseudonym(tenant, checked_subject_id(subject_id))
-        note_subject(request, pseudonym)
+        note_subject(request, caller, checked_subject_id(subject_id))
 
-    def work() -> dict[str, Any]:
+    def work() -> AuditLogAnswer:
         before = None
         if cursor is not None:
-            opened = open_cursor(runtime.keyring, cursor, purpose=_CURSOR_PURPOSE, tenant=tenant)
-            before = int(opened)
+            before = int(open_cursor(keyring, cursor, purpose=_CURSOR_PURPOSE, tenant=tenant))
+        pseudonym = None if subject_id is None else store.signer.pseudonym(tenant, subject_id)
         lines, earlier = store.audit_log.page(
             tenant, limit=limit, before=before, pseudonym=pseudonym
         )
-        return {
-            "lines": [_answered(line) for line in lines],
-            "next_cursor": None
+        return AuditLogAnswer(
+            **common,
+            # Without its number, which would tell how much the other tenants do.
+            lines=[
+                AuditLine(
+                    at=line.at,
+                    actor=line.actor,
+                    action=line.action,
+                    subject=line.pseudonym,
+                    outcome=line.outcome,
+                    detail=line.detail,
+                    request_id=line.request_id,
+                )
+                for line in lines
+            ],
+            next_cursor=None
             if earlier is None
-            else close_cursor(
-                runtime.keyring, str(earlier), purpose=_CURSOR_PURPOSE, tenant=tenant
-            ),
-        }
+            else close_cursor(keyring, str(earlier), purpose=_CURSOR_PURPOSE, tenant=tenant),
+        )
 
-    return answer(request, await gate.query(work))
-
-
-def _answered(line: Line) -> dict[str, Any]:
-    # Without its number, which would tell how much the other tenants do.
-    return {
-        "at": iso_time(line.at),
-        "actor": line.actor,
-        "action": line.action,
-        "subject": line.pseudonym,
-        "outcome": line.outcome,
-        "detail": line.detail,
-        "request_id": line.request_id,
-    }
+    return await gate.query(work)

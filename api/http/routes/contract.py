@@ -1,15 +1,16 @@
 """The contract in force, and the decoy generator for clients that lift."""
 
-from fastapi import APIRouter, Depends, Request
-from starlette.responses import Response
+from typing import Any
 
-from api.http.answers import answer, has_copy
+from fastapi import APIRouter, Depends, Request, Response
+
+from api.http.answers import has_copy
 from api.http.auth import CallerDep, holding
-from api.http.deps import GateDep, RuntimeDep
+from api.http.deps import Common, GateDep, RuntimeDep
 from api.http.errors import ApiError
 from api.http.openapi import EVERY_CALL, error_responses
 from api.http.receipts import receipt_key_json
-from api.http.schemas import ContractAnswer
+from api.http.schemas import ContractAnswer, ReceiptKey
 from templates.decoys import DecoyGenerator
 
 router = APIRouter(prefix="/v1/contract", tags=["Operations"])
@@ -17,24 +18,22 @@ router = APIRouter(prefix="/v1/contract", tags=["Operations"])
 
 @router.get(
     "",
-    response_model=ContractAnswer,
     responses=error_responses(*EVERY_CALL, "replayed"),
     summary="The contract and its security levels",
 )
 async def get_contract(
-    request: Request, caller: CallerDep, runtime: RuntimeDep, gate: GateDep
-) -> Response:
+    caller: CallerDep, runtime: RuntimeDep, gate: GateDep, common: Common
+) -> ContractAnswer:
     """Any valid key may read it. What the contract seals is not part of it."""
     tenant = await gate.query(lambda: runtime.store.tenants.get(caller.tenant))
-    return answer(
-        request,
-        {
-            **runtime.contract.public(),
-            "photos": runtime.pack is not None,
-            "generator": isinstance(runtime.source, DecoyGenerator),
-            "template_enrollment": tenant.template_enrollment,
-            "receipt_key": receipt_key_json(runtime.store.signer.public_key()),
-        },
+    public: dict[str, Any] = runtime.contract.public()
+    return ContractAnswer(
+        **common,
+        **public,
+        photos=runtime.pack is not None,
+        generator=isinstance(runtime.source, DecoyGenerator),
+        template_enrollment=tenant.template_enrollment,
+        receipt_key=ReceiptKey(**receipt_key_json(runtime.store.signer.public_key())),
     )
 
 

@@ -10,12 +10,13 @@ from starlette.requests import ClientDisconnect
 from starlette.responses import FileResponse, Response
 from starlette.types import Receive, Scope, Send
 
-from api.http.answers import answer, has_copy
-from api.http.auth import Caller, CallerDep
-from api.http.deps import RuntimeDep
+from api.http.answers import has_copy
+from api.http.auth import CallerDep
+from api.http.deps import Common, RuntimeDep
 from api.http.errors import ApiError
 from api.http.openapi import EVERY_CALL, error_responses
-from api.http.schemas import PackAnswer
+from api.http.schemas import PackAnswer, PackFileEntry
+from api.http.tokens import SubjectToken
 from api.limits.admission import Downloads
 from api.service.served_graphs import licence_of
 
@@ -27,7 +28,7 @@ SLOWEST_BYTES_S = 64 * 1024
 """How long a download may take: some seconds, and more of them the larger the file is."""
 
 
-async def holding_token(caller: CallerDep) -> Caller:
+async def token_of(caller: CallerDep) -> SubjectToken:
     """Demand a token.
 
     Raises
@@ -41,7 +42,7 @@ async def holding_token(caller: CallerDep) -> Caller:
             "the graphs are for pages: ask for a token (POST /v1/tokens), and send that",
             {"token": "missing"},
         )
-    return caller
+    return caller.subject_token
 
 
 class _GraphFile(FileResponse):
@@ -69,12 +70,11 @@ class _GraphFile(FileResponse):
 
 @router.get(
     "",
-    dependencies=[Depends(holding_token)],
-    response_model=PackAnswer,
+    dependencies=[Depends(token_of)],
     responses=error_responses(*EVERY_CALL, "forbidden", "not_found", "replayed"),
     summary="The graphs that the contract names",
 )
-async def list_pack(request: Request, runtime: RuntimeDep) -> Response:
+async def list_pack(runtime: RuntimeDep, common: Common) -> PackAnswer:
     """With a token, of any action, where the deployment serves its pack (`serve_pack`).
 
     An API key is `forbidden`: its server has no use for the graphs.
@@ -82,25 +82,23 @@ async def list_pack(request: Request, runtime: RuntimeDep) -> Response:
     pack = runtime.pack
     if pack is None or not runtime.graphs:
         raise _not_served()
-    return answer(
-        request,
-        {
-            "name": pack.info.name,
-            "licence": licence_of(pack),
-            "contract_id": runtime.contract.contract_id,
-            "files": [
-                {
-                    "role": graph.role,
-                    "kind": graph.kind,
-                    "file": graph.file,
-                    "sha256": graph.sha256,
-                    "bytes": graph.size,
-                    "path": f"{router.prefix}/{graph.sha256}",
-                    "input_size": list(graph.input_size),
-                }
-                for graph in runtime.graphs.values()
-            ],
-        },
+    return PackAnswer(
+        **common,
+        name=pack.info.name,
+        licence=licence_of(pack),
+        contract_id=runtime.contract.contract_id,
+        files=[
+            PackFileEntry(
+                role=graph.role,
+                kind=graph.kind,
+                file=graph.file,
+                sha256=graph.sha256,
+                bytes=graph.size,
+                path=f"{router.prefix}/{graph.sha256}",
+                input_size=list(graph.input_size),
+            )
+            for graph in runtime.graphs.values()
+        ],
     )
 
 
@@ -128,7 +126,7 @@ async def list_pack(request: Request, runtime: RuntimeDep) -> Response:
 )
 async def get_pack_file(
     request: Request,
-    caller: Annotated[Caller, Depends(holding_token)],
+    token: Annotated[SubjectToken, Depends(token_of)],
     runtime: RuntimeDep,
     sha256: Annotated[str, Path(description="Of a file of GET /v1/pack.")],
 ) -> Response:
@@ -150,7 +148,7 @@ async def get_pack_file(
     return _GraphFile(
         graph.path,
         headers=headers,
-        place=downloads.place(key=caller.prefix, token=caller.name),
+        place=downloads.place(key=token.key_prefix, token=token.digest),
         seconds=FIRST_S + graph.size / SLOWEST_BYTES_S,
     )
 

@@ -1,19 +1,24 @@
 """Export and import of one subject, encrypted."""
 
 import base64
-from typing import Any
 
-from fastapi import APIRouter, Request
-from starlette.responses import Response
+from fastapi import APIRouter, Request, Response
 
-from api.http.answers import answer
 from api.http.audit import by
 from api.http.auth import note_subject
-from api.http.bodies import base64_field, sent_json
-from api.http.deps import Exports, GateDep, RuntimeDep, SubjectDep
+from api.http.bodies import read_json
+from api.http.deps import (
+    Common,
+    Exports,
+    GateDep,
+    PreconditionDep,
+    RuntimeDep,
+    SubjectDep,
+    etag,
+)
 from api.http.errors import ApiError
-from api.http.openapi import BODY, EVERY_CALL, IMPORT_BODY, error_responses
-from api.http.preconditions import PreconditionDep, etag
+from api.http.openapi import BODY, EVERY_CALL, body_of, error_responses
+from api.http.requests import ImportJson
 from api.http.schemas import ExportAnswer, ImportAnswer
 from api.http.transfer import open_export
 from templates.store.identifiers import checked_subject_id
@@ -24,7 +29,6 @@ router = APIRouter(prefix="/v1/subjects", tags=["People"])
 
 @router.get(
     "/{subject_id}/export",
-    response_model=ExportAnswer,
     responses=error_responses(
         *EVERY_CALL,
         "forbidden",
@@ -36,8 +40,13 @@ router = APIRouter(prefix="/v1/subjects", tags=["People"])
     summary="Export a subject, encrypted",
 )
 async def export_subject(
-    request: Request, caller: Exports, subject: SubjectDep, runtime: RuntimeDep, gate: GateDep
-) -> Response:
+    request: Request,
+    caller: Exports,
+    subject: SubjectDep,
+    runtime: RuntimeDep,
+    gate: GateDep,
+    common: Common,
+) -> ExportAnswer:
     """Right: `export`. The template is un-rotated inside the encryption; a holder's rotation stays.
 
     Only keys with `enroll` or `admin` are told `not_enrolled`; others get `not_found`.
@@ -50,19 +59,16 @@ async def export_subject(
         if caller.sees_enrollment:
             raise ApiError("not_enrolled", "nobody is enrolled under this id")
         raise ApiError("not_found", "there is nothing to export")
-    return answer(
-        request,
-        {
-            "export": base64.b64encode(exported).decode("ascii"),
-            "contract_id": runtime.contract.contract_id,
-            "key_id": runtime.export_key.key_id,
-        },
+    return ExportAnswer(
+        **common,
+        export=base64.b64encode(exported).decode("ascii"),
+        contract_id=runtime.contract.contract_id,
+        key_id=runtime.export_key.key_id,
     )
 
 
 @router.post(
     "/import",
-    response_model=ImportAnswer,
     responses={
         200: {"description": "An earlier enrollment was replaced."},
         201: {"model": ImportAnswer, "description": "The subject is new."},
@@ -75,16 +81,18 @@ async def export_subject(
             "enrollment_conflict",
         ),
     },
-    openapi_extra=IMPORT_BODY,
+    openapi_extra=body_of(json=ImportJson),
     summary="Import a subject that was exported",
 )
 async def import_subject(
     request: Request,
+    response: Response,
     caller: Exports,
     runtime: RuntimeDep,
     gate: GateDep,
     precondition: PreconditionDep,
-) -> Response:
+    common: Common,
+) -> ImportAnswer:
     """Rights: `export` and `admin`. The template gets a new id, and a rotation of the tenant's.
 
     It needs a holder's key where it did before, and the same one. An old export brings back who was
@@ -92,22 +100,19 @@ async def import_subject(
     `If-None-Match` and `If-Match` say what may be replaced, as of an enrollment.
     """
     caller.require("admin")
-    settings = runtime.settings
     async with gate.admitted(caller.prefix):
-        body = await sent_json(request, settings, ("export",))
-        data = base64_field(body.get("export"), "export", code="invalid_template")
+        sent = await read_json(request, runtime.settings, ImportJson)
         exported = await gate.query(
             lambda: open_export(
-                data,
+                sent.export,
                 key=runtime.export_key,
                 tenant=caller.tenant,
                 contract_id=runtime.contract.contract_id,
             )
         )
-        subject = checked_subject_id(exported.subject_id)
-        note_subject(request, runtime.store.signer.pseudonym(caller.tenant, subject))
+        note_subject(request, caller, checked_subject_id(exported.subject_id))
 
-        def work() -> dict[str, Any]:
+        def work() -> ImportAnswer:
             epoch = runtime.epoch(caller.tenant)
             enroller = runtime.enroller(caller.tenant, epoch)
             salt = exported.holder_salt
@@ -129,18 +134,16 @@ async def import_subject(
                 action="import",
                 by=by(request),
             )
-            return {
-                "template_id": stored.template_id,
-                "contract_id": enrollment.contract_id,
-                "replaced": not stored.created,
-                "holder_key": salt is not None,
-                "subject_id": exported.subject_id,
-            }
+            return ImportAnswer(
+                **common,
+                subject_id=exported.subject_id,
+                template_id=stored.template_id,
+                contract_id=enrollment.contract_id,
+                replaced=not stored.created,
+                holder_key=salt is not None,
+            )
 
-        body = await gate.compute(work, key=caller.prefix)
-    return answer(
-        request,
-        body,
-        status=200 if body["replaced"] else 201,
-        headers={"ETag": etag(body["template_id"])},
-    )
+        answer = await gate.compute(work, key=caller.prefix)
+    response.status_code = 200 if answer.replaced else 201
+    response.headers["ETag"] = etag(answer.template_id)
+    return answer

@@ -2,33 +2,43 @@
 
 The order of a verification, which is what bounds an attacker::
 
-    body read ─▶ locked out, or token used? template ─▶ probe, decision
+    body read ─▶ level, liveness, one use ─▶ probe ─▶ locked out? template ─▶ decision
         ─▶ one write: token used up, lockout checked and counted, audit line ─▶ answer
 
 No decision leaves before that write has committed. So of requests that run at the same time
 no more are answered than of requests that come one after the other.
 """
 
-from typing import Any
+from collections.abc import Callable
+from functools import partial
 
 from fastapi import APIRouter, Request
-from starlette.responses import Response
 
-from api.http.answers import answer
 from api.http.audit import by
 from api.http.auth import Caller
-from api.http.deps import GateDep, RuntimeDep, SubjectDep, Verifies
+from api.http.bodies import is_form, read_form, read_json, too_many_images
+from api.http.challenges import Challenge, opened_challenge
+from api.http.deps import Common, GateDep, RuntimeDep, SubjectDep, Verifies
 from api.http.errors import ApiError
-from api.http.holder_keys import HolderKeyHeaderDep, wiping
-from api.http.openapi import BODY, EVERY_CALL, PHOTO, VERIFY_BODY, error_responses
-from api.http.probes import Probe, sent_probe
+from api.http.openapi import BODY, EVERY_CALL, PHOTO, body_of, error_responses
+from api.http.requests import VerifyForm, VerifyJson
 from api.http.schemas import VerifyAnswer
 from api.service.metrics import count_decision, step
 from api.service.runtime import Runtime
 from templates.errors import ContractMismatch
+from templates.keys.holder_key import wipe
 from templates.store.attempts import Attempt
 from templates.store.audit_log import By
-from verify import Decision
+from verify import (
+    MAX_FRAMES,
+    MAX_PROBE_PHOTOS,
+    MIN_FRAMES,
+    Decision,
+    PhotoProbe,
+    probe_of_embeddings,
+    probe_of_frames,
+    probe_of_photos,
+)
 
 router = APIRouter(prefix="/v1/subjects", tags=["Enroll and verify"])
 
@@ -50,10 +60,8 @@ CODES = (
 
 @router.post(
     "/{subject_id}/verify",
-    response_model=VerifyAnswer,
-    response_model_exclude_none=True,
     responses=error_responses(*CODES),
-    openapi_extra=VERIFY_BODY,
+    openapi_extra=body_of(form=VerifyForm, json=VerifyJson),
     summary="Is this the subject?",
 )
 async def verify(
@@ -62,8 +70,8 @@ async def verify(
     subject: SubjectDep,
     runtime: RuntimeDep,
     gate: GateDep,
-    holder_key_header: HolderKeyHeaderDep,
-) -> Response:
+    common: Common,
+) -> VerifyAnswer:
     """Rights: `verify`, and `embeddings` for a probe that is not a photo.
 
     The probe is 1 to 5 photos, or embeddings, which must show one and the same person and are
@@ -85,67 +93,154 @@ async def verify(
 
     A token for this subject may stand in the place of the API key; the decision uses it up.
     """
+    token = caller.subject_token
     async with gate.admitted(caller.prefix):
         with step("body"):
-            probe = await sent_probe(request, runtime, caller, subject, holder_key_header)
+            sent = await _sent(request, runtime, caller)
+        asked = sent.level if token is None else token.level_of(sent.level)
+        level = runtime.levels.in_force(asked, lowest_of_key=caller.lowest_level)
+        challenge = _challenge(runtime, caller, subject, sent.challenge_id)
 
         def work() -> Decision:
-            if caller.subject_token is not None:
-                # Once more: the body and the turn to compute may have taken a while.
-                caller.subject_token.require_in_time()
-            return _decide(runtime, caller, subject, probe, by(request))
+            try:
+                return _decide(runtime, caller, subject, sent, level, challenge, by(request))
+            finally:
+                wipe(sent.holder_key)
 
-        decision = await gate.compute(wiping(probe.holder_key, work), key=caller.prefix)
-    body = _body(decision, caller)
-    request.state.log["security_level"] = body["level"]
-    request.state.log["decision"] = body["decision"]
-    request.state.log["liveness"] = body["liveness"]
-    count_decision(
-        accepted=decision.accepted, reason=decision.reason, level=decision.level, probe=probe.kind
+        decision = await gate.compute(work, key=caller.prefix)
+    answer = VerifyAnswer(
+        **common,
+        decision="accept" if decision.accepted else "reject",
+        reason=decision.reason,
+        liveness=decision.liveness,
+        level=decision.level,
+        fmr=decision.fmr,
+        contract_id=decision.contract_id,
+        calibration_id=decision.calibration_id,
+        distance=decision.distance if caller.sees_scores else None,
+        liveness_failure=decision.liveness_failure if caller.sees_scores else None,
+        advice=decision.advice,
     )
-    return answer(request, body)
+    request.state.log.update(
+        security_level=level, decision=answer.decision, liveness=answer.liveness
+    )
+    count_decision(accepted=decision.accepted, reason=decision.reason, level=level, probe=sent.kind)
+    return answer
 
 
-def _body(decision: Decision, caller: Caller) -> dict[str, Any]:
-    body: dict[str, Any] = {
-        "decision": "accept" if decision.accepted else "reject",
-        "reason": decision.reason,
-        "liveness": decision.liveness,
-        "level": decision.level,
-        "fmr": decision.fmr,
-        "contract_id": decision.contract_id,
-        "calibration_id": decision.calibration_id,
-    }
-    if {"scores", "enroll"} <= caller.rights:
-        body["distance"] = decision.distance
-        if decision.liveness_failure is not None:
-            body["liveness_failure"] = str(decision.liveness_failure)
-    if decision.advice is not None:
-        body["advice"] = decision.advice
-    return body
+async def _sent(request: Request, runtime: Runtime, caller: Caller) -> VerifyForm | VerifyJson:
+    """Read the probe, and refuse what can be refused without decoding anything."""
+    settings = runtime.settings
+    if not is_form(request):
+        sent = await read_json(request, settings, VerifyJson, photos="image")
+        # After the fields: who only forgot how to send a photo needs no further right.
+        caller.require("embeddings")
+        runtime.liveness.require(photos=False, challenge=False)
+        return sent
+    runtime.required_pack()
+    form = await read_form(request, settings, VerifyForm, photos="image", most=MAX_FRAMES)
+    answers = form.challenge_id is not None
+    most = MAX_FRAMES if answers else min(MAX_PROBE_PHOTOS, settings.max_images)
+    if len(form.photos) > most:
+        raise too_many_images(most)
+    if answers and len(form.photos) < MIN_FRAMES:
+        raise ApiError(
+            "validation_failed",
+            f"a challenge is answered by {MIN_FRAMES} to {MAX_FRAMES} frames",
+            {"field": "images"},
+        )
+    runtime.liveness.require(photos=True, challenge=answers)
+    return form
 
 
-def _decide(runtime: Runtime, caller: Caller, subject: str, probe: Probe, who: By) -> Decision:
-    """Decide and record; a subject that is not enrolled costs what an enrolled one does."""
+def _challenge(
+    runtime: Runtime, caller: Caller, subject: str, challenge_id: str | None
+) -> Challenge | None:
+    if challenge_id is None:
+        return None
+    return opened_challenge(
+        runtime.keyring,
+        challenge_id,
+        tenant=caller.tenant,
+        subject=subject,
+        token=caller.subject_token,
+    )
+
+
+def _decide(
+    runtime: Runtime,
+    caller: Caller,
+    subject: str,
+    sent: VerifyForm | VerifyJson,
+    level: str,
+    challenge: Challenge | None,
+    who: By,
+) -> Decision:
+    """Make the probe, decide, and record; a subject that is not enrolled costs what others do."""
+    if caller.subject_token is not None:
+        # Once more: the body and the turn to compute may have taken a while.
+        caller.subject_token.require_in_time()
+    probe = _probe(runtime, sent, challenge)
+    live = challenge is not None or runtime.liveness.policy.passive
+    spent = challenge or caller.subject_token
 
     def compare(attempt: Attempt) -> Decision:
-        template = attempt.template
+        template, epoch = attempt.template, attempt.rotation_epoch
         if template is not None:
-            verifier = runtime.verifier(caller.tenant, template.record.rotation_epoch)
-            return probe.compare(verifier, template)
-        if caller.sees_enrollment:
+            epoch = template.record.rotation_epoch
+        elif caller.sees_enrollment:
             raise _why_not(runtime, caller.tenant, subject)
-        verifier = runtime.verifier(caller.tenant, attempt.rotation_epoch)
-        return probe.compare(verifier, runtime.stand_in.open())
+        stored = template or runtime.stand_in.open()
+        verifier = runtime.verifier(caller.tenant, epoch)
+        with step("decide"):
+            if isinstance(probe, bytes):
+                return verifier.decide_template(
+                    probe, stored, holder_key=sent.holder_key, level=level
+                )
+            decision = verifier.decide_embedding(
+                probe.embedding,
+                stored,
+                holder_key=sent.holder_key,
+                level=level,
+                photos=probe.photos,
+            )
+        if live:
+            decision = decision.with_liveness(probe.failure)
+        return decision.with_advice(clear=probe.clear)
 
     return runtime.store.attempts.decide(
         caller.tenant,
         subject,
         compare,
         contract_id=runtime.contract.contract_id,
-        token=probe.token,
+        token=None if spent is None else spent.digest,
         by=who,
     )
+
+
+def _probe(
+    runtime: Runtime, sent: VerifyForm | VerifyJson, challenge: Challenge | None
+) -> PhotoProbe | bytes:
+    """Embed photos, hold frames against their challenge, or average embeddings.
+
+    A lifted probe is returned as its wire bytes.
+    """
+    contract = runtime.contract
+    if isinstance(sent, VerifyJson):
+        lifted = sent.template
+        return probe_of_embeddings(contract, sent.rows) if lifted is None else lifted
+    make: Callable[..., PhotoProbe] = probe_of_photos
+    if challenge is not None:
+        make = partial(probe_of_frames, movements=challenge.movements)
+    with step("photo"):
+        return make(
+            runtime.required_pack(),
+            contract,
+            sent.photos,
+            passive=runtime.liveness.policy.passive,
+            policy=sent.face,
+            limits=runtime.image_limits,
+        )
 
 
 def _why_not(runtime: Runtime, tenant: str, subject: str) -> Exception:

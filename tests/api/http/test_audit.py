@@ -7,9 +7,9 @@ import pytest
 
 from api.http.schemas import AuditLogAnswer
 from templates.store.audit_log import AuditLog, Line
+from tests.api.calls import b64, lifted
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, images, photo
-from tests.api.http.test_enrollment import b64, lifted
 from tests.api.shapes import assert_answer, assert_error
 
 
@@ -123,6 +123,18 @@ def test_refusals_are_written_with_their_code(service: tuple[Client, Deployment]
         ("export", "forbidden", lambda: client.get(f"{path}/export", headers=bearer(verifier))),
         ("unlock", "forbidden", lambda: client.delete(f"{path}/lockout", headers=bearer(verifier))),
         ("audit-log", "forbidden", lambda: client.get("/v1/audit-log", headers=bearer(verifier))),
+        (
+            "list-subjects",
+            "forbidden",
+            lambda: client.get("/v1/subjects", headers=bearer(verifier)),
+        ),
+        ("get-subject", "not_enrolled", lambda: client.get("/v1/subjects/alice2")),
+        (
+            "create-challenge",
+            "validation_failed",
+            lambda: client.post("/v1/challenges", json={"x": 1}),
+        ),
+        ("check-photo", "malformed_request", lambda: client.post("/v1/photos/check", json={})),
         ("audit-log", "validation_failed", lambda: client.get("/v1/audit-log?cursor=1")),
         ("verify", "unsupported_image", lambda: send(files=images(b"no picture", name="image"))),
         ("verify", "accept", lambda: send(once, files=images(photo(1, 5), name="image"))),

@@ -121,9 +121,9 @@ def test_what_is_no_photo_needs_the_right_to_embeddings(
     client: Client, keys: dict[str, str]
 ) -> None:
     for method, path, body in (
-        ("PUT", "/v1/subjects/a/enrollment", {"template": "x"}),
-        ("POST", "/v1/subjects/a/verify", {"template": "x"}),
-        ("POST", "/v1/subjects/a/verify", {"embedding": []}),
+        ("PUT", "/v1/subjects/a/enrollment", {"template": "eA=="}),
+        ("POST", "/v1/subjects/a/verify", {"template": "eA=="}),
+        ("POST", "/v1/subjects/a/verify", {"embedding": [1.0]}),
     ):
         answer = client.request(method, path, json=body, headers=bearer(keys["embeddings"]))
         assert assert_error(answer, 403, "forbidden") == {"missing": ["embeddings"]}

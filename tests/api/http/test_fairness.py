@@ -16,7 +16,7 @@ from api.http.app import create_app
 from api.limits.admission import Gate, Slots
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, deploy, images, photo
-from verify import Verifier
+from verify import probe_of_photos
 
 SENT = 20
 """Photos that the busy key sends at once: fewer than its places, so that all of them wait."""
@@ -36,12 +36,11 @@ def test_a_photo_waits_for_at_most_two_turns_of_a_busy_key(
     client, deployment = service
     busy, other = deployment.key("verify", tenant="busy"), deployment.key("verify", tenant="other")
     go_on, turns = threading.Event(), []
-    photo_probe = Verifier.photo_probe
 
-    def counted(self: Verifier, pack: Any, data: list[bytes], **options: Any) -> Any:
+    def counted(pack: Any, contract: Any, data: list[bytes], **options: Any) -> Any:
         turns.append("other" if data == [single] else "busy")
         go_on.wait()
-        return photo_probe(self, pack, data, **options)
+        return probe_of_photos(pack, contract, data, **options)
 
     def verify(token: str, data: bytes) -> int:
         return client.post(
@@ -55,7 +54,7 @@ def test_a_photo_waits_for_at_most_two_turns_of_a_busy_key(
             time.sleep(0.01)
 
     single = photo(2)
-    monkeypatch.setattr(Verifier, "photo_probe", counted)
+    monkeypatch.setattr("api.http.routes.verification.probe_of_photos", counted)
     with ThreadPoolExecutor(SENT + 1) as pool:
         try:
             flood = [pool.submit(verify, busy, photo(1, shot)) for shot in range(SENT)]

@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
+from tests.api.calls import b64, lifted
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, images, photo
-from tests.api.http.test_enrollment import b64, lifted
 from tests.api.shapes import assert_error
 
 PATHS = [

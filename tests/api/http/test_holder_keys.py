@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 
 from api.http.app import create_app
-from api.http.holder_keys import HEADER
 from api.http.schemas import (
     EnrollmentAnswer,
     ImportAnswer,
@@ -88,7 +87,6 @@ def test_only_the_key_accepts(both: tuple[Client, Deployment]) -> None:
     assert enroll(client, "anna")["holder_key"] is True
     assert decided(client, "anna", KEY) == "accept"
     assert decided(client, "anna", KEY + "=") == "accept"
-    assert decided(client, "anna", headers={HEADER: KEY}) == "accept"
     assert decided(client, "anna", KEY, person=2) == "reject"
     blind = bearer(deployment.key("verify"))
     rejections = [
@@ -158,8 +156,6 @@ def test_templates_embeddings_and_lifted_probes(client: Client, deployment: Depl
             body = probe | ({} if key is None else {"holder_key": key})
             answer = client.post("/v1/subjects/lifted/verify", json=body)
             assert assert_answer(answer, 200, VerifyAnswer)["decision"] == expected
-        answer = client.post("/v1/subjects/lifted/verify", json=probe, headers={HEADER: KEY})
-        assert assert_answer(answer, 200, VerifyAnswer)["decision"] == "accept"
 
 
 MALFORMED = [
@@ -191,9 +187,6 @@ def test_malformed_keys_are_refused_and_not_repeated(
         ]
         if isinstance(key, str) and key.isascii() and "\n" not in key:
             answers += [
-                client.post(
-                    "/v1/subjects/strict/verify", json={"embedding": probe}, headers={HEADER: key}
-                ),
                 client.put(
                     "/v1/subjects/strict/enrollment",
                     files=images(photo(1)),
@@ -203,13 +196,6 @@ def test_malformed_keys_are_refused_and_not_repeated(
         for answer in answers:
             assert assert_error(answer, 422, "validation_failed") == {"field": "holder_key"}
             assert len(str(key)) < 20 or str(key)[:20] not in answer.text
-
-
-def test_the_key_stands_in_one_place(client: Client) -> None:
-    enroll(client, "once")
-    path, photos = "/v1/subjects/once/verify", images(photo(1, 9), name="image")
-    answer = client.post(path, files=photos, data={"holder_key": KEY}, headers={HEADER: KEY})
-    assert_error(answer, 422, "validation_failed")
 
 
 def test_renewed_rotations_and_master_keys_need_the_same_key(

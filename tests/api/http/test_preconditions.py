@@ -6,12 +6,16 @@ import pytest
 from httpx import Response
 
 from api.http.schemas import EnrollmentAnswer, ImportAnswer, SubjectAnswer
+from tests.api.calls import b64, lifted
 from tests.api.client import Client
 from tests.api.deployment import Deployment, codes, images, photo
-from tests.api.http.test_enrollment import b64, lifted, path
 from tests.api.shapes import assert_answer, assert_error
 
 NEVER = {"If-None-Match": "*"}
+
+
+def path(subject: str) -> str:
+    return f"/v1/subjects/{subject}/enrollment"
 
 
 def only(template_id: str) -> dict[str, str]:

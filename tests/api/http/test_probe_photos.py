@@ -9,9 +9,9 @@ import pytest
 from api.http.app import create_app
 from api.http.schemas import LockoutAnswer, VerifyAnswer
 from models.pack import ModelPack
+from tests.api.calls import ask, embedding
 from tests.api.client import Client
 from tests.api.deployment import Deployment, N, bearer, deploy, images, photo
-from tests.api.http.test_verification import ask, embedding
 from tests.api.shapes import assert_answer, assert_error
 
 BURST = tuple(photo(1, shot) for shot in (5, 6, 7))
@@ -98,9 +98,8 @@ def test_more_than_five_are_too_many(client: Client, scored: str, tmp_path: Path
 
 def test_photos_come_under_one_name(client: Client, scored: str) -> None:
     both = images(BURST[0], name="image") + images(BURST[1], name="images")
-    for files, field in ((both, "image"), (both[::-1], "images"), (images(*BURST, name="x"), None)):
-        details = assert_error(ask(client, scored, files=files), 422, "validation_failed")
-        assert details == {"field": field or "image"}
+    for files in (both, images(*BURST, name="x")):
+        assert_error(ask(client, scored, files=files), 422, "validation_failed")
 
 
 def test_hostile_embeddings(client: Client, scored: str) -> None:
@@ -119,7 +118,6 @@ def test_hostile_embeddings(client: Client, scored: str) -> None:
         [good[:-1]],
         {"0": good},
         "AAAA",
-        None,
     ):
         answer = ask(client, scored, json={"embeddings": case})
         assert_error(answer, 400, "invalid_embedding")

@@ -8,13 +8,11 @@ import pytest
 from api.http.app import create_app
 from api.http.schemas import VerifyAnswer
 from templates.contract import wire
-from templates.keys.randomness import Keystream
 from templates.keys.sealing import MasterKeyring
-from templates.space.lifting import Strategy, lift
 from templates.space.subspace import SubspaceBatch
+from tests.api.calls import ask, b64, embedding, probe
 from tests.api.client import Client
 from tests.api.deployment import AXES, PROBE_M, Deployment, N, bearer, deploy, images, photo
-from tests.api.http.test_enrollment import b64
 from tests.api.shapes import assert_answer, assert_error
 
 PRODUCT_KEYS = {
@@ -41,27 +39,6 @@ def token(client: Client, deployment: Deployment) -> str:
 def sender(deployment: Deployment, token: str) -> str:
     """A key that may also send embeddings."""
     return deployment.key("verify", "embeddings")
-
-
-def ask(client: Client, token: str, subject: str = "alice", **request: Any) -> Any:
-    headers = bearer(token) | request.pop("headers", {})
-    return client.post(f"/v1/subjects/{subject}/verify", headers=headers, **request)
-
-
-def embedding(client: Client, person: int, shot: int = 5) -> list[float]:
-    pack = client.app.state.runtime.pack
-    return [float(x) for x in pack.embed_photo(photo(person, shot)).embedding]
-
-
-def probe(deployment: Deployment, descriptor: list[float], *, m: int = PROBE_M) -> bytes:
-    batch = lift(
-        deployment.source.project(np.array([descriptor], dtype=np.float32)),
-        strategy=Strategy.ADVERSARIAL,
-        m=m,
-        source=deployment.source,
-        stream=Keystream.seeded("probe"),
-    )
-    return wire.encode(batch[0], contract_id=deployment.contract.contract_id)
 
 
 def test_the_answer_is_exactly_the_contract(client: Client, token: str) -> None:
@@ -193,7 +170,6 @@ def test_hostile_embeddings(client: Client, sender: str) -> None:
         [0.1] * 5000,
         "AAAA",
         {"0": 1.0},
-        None,
         7,
     ]
     import json

@@ -18,7 +18,9 @@ from starlette.types import Message, Receive, Scope, Send
 from api.http.bodies import MAX_FIELD_BYTES, MAX_JSON_PARTS, read_json
 from api.http.context import RequestContext
 from api.http.errors import ApiError
+from api.http.requests import EnrollmentJson
 from api.limits.admission import MAX_JSON_BYTES, Gate
+from api.settings import Settings, load_settings
 from tests.api.client import Client
 from tests.api.deployment import Deployment, images, photo
 from tests.api.shapes import assert_error
@@ -26,6 +28,11 @@ from tests.patience import PATIENCE_S
 
 ENROLL, VERIFY = "/v1/subjects/limits/enrollment", "/v1/subjects/limits/verify"
 MIB = 1024 * 1024
+JSON = [(b"content-type", b"application/json")]
+
+
+def settings(**changes: float) -> Settings:
+    return load_settings(**changes)
 
 
 def padded(size: int) -> bytes:
@@ -172,9 +179,9 @@ def test_a_body_that_does_not_arrive_is_given_up(client: Client, deployment: Dep
             await anyio.sleep(60)
             return {}
 
-        request = Request({"type": "http", "headers": []}, receive)
+        request = Request({"type": "http", "headers": JSON}, receive)
         with pytest.raises(ApiError, match="did not arrive") as caught:
-            await read_json(request, max_bytes=100, timeout_s=0.05)
+            await read_json(request, settings(body_timeout_s=0.05), EnrollmentJson)
         assert caught.value.code == "malformed_request"
 
     anyio.run(never)
@@ -284,21 +291,21 @@ def test_large_json_is_parsed_in_a_thread(
     parsed_by: list[int] = []
     parse = json.loads
 
-    def parse_json(body: bytes) -> Any:
+    def loads(text: str, **options: Any) -> Any:
         parsed_by.append(threading.get_ident())
-        return parse(body)
+        return parse(text, **options)
 
-    monkeypatch.setattr("api.http.bodies.parse_json", parse_json)
+    monkeypatch.setattr("api.http.bodies.json.loads", loads)
     body = b'{"template": "' + b"A" * size + b'"}'
 
     async def receive() -> dict[str, Any]:
         return {"type": "http.request", "body": body, "more_body": False}
 
     async def read() -> Any:
-        request = Request({"type": "http", "headers": []}, receive)
-        return await read_json(request, max_bytes=10**6, timeout_s=5)
+        request = Request({"type": "http", "headers": JSON}, receive)
+        return await read_json(request, settings(), EnrollmentJson)
 
-    assert anyio.run(read) == {"template": "A" * size}
+    assert anyio.run(read).template == bytes(3 * size // 4)
     assert [thread != threading.get_ident() for thread in parsed_by] == [apart]
 
 
@@ -346,7 +353,7 @@ def test_a_body_of_more_values_than_any_request_has_is_not_parsed(
     """Small values take up to thirty times the memory of their text."""
     body = b'{"embedding":[' + unit * ((MAX_JSON_BYTES - 30) // len(unit)) + b"0]}"
     with monkeypatch.context() as patch:
-        patch.setattr("api.http.bodies.parse_json", None)
+        patch.setattr("api.http.bodies.json.loads", None)
         answer = client.post(VERIFY, content=body, headers={"Content-Type": "application/json"})
     assert_error(answer, 400, "malformed_request")
     assert f"more than {MAX_JSON_PARTS} values" in answer.json()["error"]["message"]

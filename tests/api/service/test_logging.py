@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from api.service.logging import FIELDS, JsonLines, configure, log, uvicorn_log_config
+from tests.api.calls import b64, lifted
 from tests.api.client import Client
 from tests.api.deployment import Deployment, N, bearer, images, photo, unit
-from tests.api.http.test_enrollment import b64, lifted
 
 SUBJECT = "subject-who-must-not-be-logged"
 LINE_FIELDS = {"time", "level", "logger", "event"} | FIELDS

@@ -34,6 +34,7 @@ from templates.contract.verdict import Verdict
 from templates.decoys import DecoyGenerator
 from templates.keys.sealing import MasterKeyring
 from templates.store.database import Database
+from tests.api.calls import b64, lifted
 from tests.api.cli.conftest import run
 from tests.api.client import Client
 from tests.api.deployment import (
@@ -48,7 +49,6 @@ from tests.api.deployment import (
     unit,
     write_pack,
 )
-from tests.api.http.test_enrollment import b64, lifted
 from tests.api.shapes import assert_answer, assert_error
 from tests.patience import wait_until
 
