@@ -286,21 +286,21 @@ class Runtime:
             return None
         template, in_rotation = read
         binding = self.contract.binding
+        contract_id = self.contract.contract_id
         binding.require_contract(template.record.contract_id, what="the stored template")
         stored = wire.decode(template.wire, max_n=binding.axes, max_m=binding.m)
         rotation = in_rotation.rotation.of(template.template_id)
         plain = stored.subspace.turned_by(rotation.turned_back)
         exported = Exported(
             subject_id=subject,
-            contract_id=self.contract.contract_id,
-            source=str(template.record.source),
+            source=template.record.source,
             photos=template.record.photos,
-            wire=wire.encode(plain, contract_id=self.contract.contract_id, dtype="float32"),
+            wire=wire.encode(plain, contract_id=contract_id, dtype="float32"),
             holder_salt=template.holder_salt,
         )
         template_id = template.record.template_id
         self.store.subjects.record_export(tenant, subject, template_id=template_id, by=by)
-        return seal_export(exported, key=self.export_key, tenant=tenant)
+        return seal_export(exported, key=self.export_key, contract_id=contract_id, tenant=tenant)
 
     def close(self) -> None:
         """Let go of the database's connections."""

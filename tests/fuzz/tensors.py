@@ -1,5 +1,6 @@
 """Hostile safetensors: templates, exports and decoy sources with headers and numbers that lie."""
 
+import base64
 import hashlib
 import json
 import random
@@ -18,6 +19,7 @@ from templates.decoys.source import Attributes
 from templates.keys.randomness import Keystream
 from templates.keys.sealing import KeyringSealer, MasterKeyring
 from templates.space.subspace import SubspaceBatch
+from templates.store.subject_rows import Source
 from tests.fuzz.documents import Raw, hostile
 from tests.fuzz.mutations import mutated, some, span
 
@@ -141,24 +143,22 @@ class Exports:
         self._inside = Templates()
         self.header = {
             "subject_id": "someone",
-            "contract_id": CONTRACT,
             "source": "photos",
             "photos": 3,
+            "holder_salt": "0" * 32,
         }
-        one = Exported("someone", CONTRACT, "photos", 1, self._inside.sound[0])
+        one = Exported(
+            subject_id="someone", source=Source.PHOTOS, photos=1, wire=self._inside.sound[0]
+        )
         with repeatable(random.Random(0)):
-            self.sound = [seal_export(one, key=KEY, tenant=TENANT)]
+            self.sound = [seal_export(one, key=KEY, contract_id=CONTRACT, tenant=TENANT)]
 
     def make(self, rng: random.Random) -> bytes:
         """One case."""
         if rng.random() < 0.25:
             return mutated(rng, rng.choice(self.sound), self.sound)
-        header = hostile(rng, self.header)
-        wire_bytes = self._inside.make(rng)
-        size = (
-            len(header) if rng.random() < 0.9 else rng.choice((0, 1, 4096, 4097, 2**31, 2**32 - 1))
-        )
-        plain = struct.pack(">I", size) + header + wire_bytes
+        wire_bytes = base64.urlsafe_b64encode(self._inside.make(rng)).decode()
+        plain = hostile(rng, self.header | {"wire": wire_bytes})
         if rng.random() < 0.1:
             plain = mutated(rng, plain, [plain])
         with repeatable(rng):

@@ -128,7 +128,7 @@ async def import_subject(
                 exported.subject_id,
                 epoch,
                 enrollment,
-                source=Source(exported.source),
+                source=exported.source,
                 photos=exported.photos,
                 precondition=precondition,
                 action="import",

@@ -16,6 +16,7 @@ from attacks.stored.wolves import canonical
 from models.pack import ModelPack
 from templates.contract import wire
 from templates.space.subspace import SubspaceBatch
+from templates.store.subject_rows import Source
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, deploy
 from tests.api.shapes import assert_answer, assert_error
@@ -132,12 +133,12 @@ def test_an_export_of_a_wolf_is_refused_unless_the_service_made_it_of_photos(
         sealed = seal_export(
             Exported(
                 subject_id=f"from-{source}",
-                contract_id=runtime.contract.contract_id,
-                source=source,
+                source=Source(source),
                 photos=0 if source == "template" else 3,
                 wire=wire.encode(wolf(), contract_id=runtime.contract.contract_id, dtype="float32"),
             ),
             key=runtime.export_key,
+            contract_id=runtime.contract.contract_id,
             tenant="default",
         )
         body = {"export": base64.b64encode(sealed).decode()}
