@@ -125,8 +125,25 @@ def allowed_methods(document: Mapping[str, Any], path: str) -> list[str]:
     return []
 
 
+def calls_table(document: Mapping[str, Any]) -> str:
+    """Write the table of calls of ``docs/rest.md``: each with what its description says first."""
+    calls = [
+        (f"{method.upper()} {path}", operation)
+        for path, entry in document["paths"].items()
+        for method, operation in entry.items()
+    ]
+    groups = [tag["name"] for tag in document["tags"]]
+    calls.sort(key=lambda call: groups.index(call[1]["tags"][0]))
+    rows = ["| call | does | right |", "|---|---|---|"]
+    for name, operation in calls:
+        said = operation["description"].partition(". ")[0].partition(".\n")[0].rstrip(".")
+        right = " ".join(re.sub(r"^Rights?: ", "", said).split())
+        rows.append(f"| `{name}` | {operation['summary']} | {right} |")
+    return "\n".join(rows) + "\n"
+
+
 def codes_table() -> str:
-    """Write the table of ``docs/errors.md`` from the one table of codes."""
+    """Write the table of error codes of ``docs/rest.md`` from the one table of codes."""
     rows = ["| status | code | meaning |", "|---|---|---|"]
     rows += [
         f"| {entry.status} | `{entry.code}` | {entry.meaning} |" for entry in ERROR_CODES.values()

@@ -24,7 +24,7 @@ router = APIRouter(prefix="/v1/contract", tags=["Operations"])
 async def get_contract(
     caller: CallerDep, runtime: RuntimeDep, gate: GateDep, common: Common
 ) -> ContractAnswer:
-    """Any valid key may read it. What the contract seals is not part of it."""
+    """Right: any. What the contract seals is not part of it."""
     tenant = await gate.query(lambda: runtime.store.tenants.get(caller.tenant))
     public: dict[str, Any] = runtime.contract.public()
     return ContractAnswer(

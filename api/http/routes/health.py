@@ -23,7 +23,7 @@ router = APIRouter(tags=["Operations"])
     summary="The process answers",
 )
 async def live(request: Request) -> Response:
-    """Ask nothing but the process itself."""
+    """Right: none. Ask nothing but the process itself."""
     return answer(request, {"status": "ok"})
 
 
@@ -37,7 +37,7 @@ async def live(request: Request) -> Response:
     summary="The worker can answer requests",
 )
 async def ready(request: Request) -> Response:
-    """Ask the database; after a failed write it must take one, after a failed inference do one.
+    """Right: none. After a failed write the database must take one, a failed model infer once.
 
     A worker that was told to stop answers `overloaded`.
     """
@@ -64,7 +64,7 @@ async def ready(request: Request) -> Response:
     summary="What the service has done, for Prometheus",
 )
 async def metrics(request: Request) -> Response:
-    """No series names a subject, a tenant or an API key."""
+    """Right: none. No series names a subject, a tenant or an API key."""
     limiter: anyio.CapacityLimiter = request.app.state.scrapes
     text = await anyio.to_thread.run_sync(exposition, limiter=limiter)
     return Response(text, headers={"Content-Type": CONTENT_TYPE_PLAIN_0_0_4})

@@ -15,7 +15,7 @@ router = APIRouter(prefix="/v1/key", tags=["Operations"])
 async def get_own_key(
     caller: CallerDep, runtime: RuntimeDep, gate: GateDep, common: Common
 ) -> KeyAnswer:
-    """Any valid key may ask, for itself only: never the secret, nor its label."""
+    """Right: any. A key is told of itself only, and never its secret nor its label."""
     key = await gate.query(lambda: runtime.store.api_keys.get(caller.prefix))
     return KeyAnswer(
         **common,

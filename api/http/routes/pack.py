@@ -75,7 +75,7 @@ class _GraphFile(FileResponse):
     summary="The graphs that the contract names",
 )
 async def list_pack(runtime: RuntimeDep, common: Common) -> PackAnswer:
-    """With a token, of any action, where the deployment serves its pack (`serve_pack`).
+    """Right: a token, of any action. Only where the deployment serves its pack (`serve_pack`).
 
     An API key is `forbidden`: its server has no use for the graphs.
     """
@@ -130,7 +130,7 @@ async def get_pack_file(
     runtime: RuntimeDep,
     sha256: Annotated[str, Path(description="Of a file of GET /v1/pack.")],
 ) -> Response:
-    """With a token, of any action, where the deployment serves its pack.
+    """Right: a token, of any action. Only where the deployment serves its pack.
 
     The path names the content, so a copy stays good for ever. Check its SHA-256 before it is run.
     `Range` is ignored. More files at the same time than there are places for are `overloaded`,
