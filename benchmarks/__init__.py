@@ -1,1 +1,1 @@
-"""Measurements that the documentation quotes; each prints its figures as JSON."""
+"""Measurements that the pages quote: ``python -m benchmarks NAME`` prints one table each."""

@@ -12,19 +12,13 @@ photos, what the camera showed, and their descriptors; those that are sent on pu
 must be found.
 
 Needs Chromium and the built client (``make javascript``).
-
-Example
--------
-::
-
-    python -m benchmarks.browser_client --data ../shared/data --work browser-client-run
 """
 
+import argparse
 import base64
 import json
-import os
 import re
-import shutil
+import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -36,20 +30,8 @@ from typing import Any
 import numpy as np
 from playwright.sync_api import BrowserContext, Locator, expect, sync_playwright
 
-from benchmarks.deployment import service
-from benchmarks.end_to_end import (
-    AttemptCounts,
-    Person,
-    impostor_attempts,
-    people_of,
-)
-from benchmarks.private_client import (
-    command_line,
-    fresh_database,
-    key_of,
-    prepared,
-    private_outcome,
-)
+from benchmarks import deployment
+from benchmarks.people import AttemptCounts, Person, attempt_all, impostor_attempts, people_of
 from models.decoding import decode_image
 from models.errors import FaceError
 from models.pack import ModelPack
@@ -160,8 +142,7 @@ def browser_outcome(
 ) -> tuple[AttemptCounts, list[float]]:
     """Enroll and verify everybody in the browser; also the seconds from each photo to its answer.
 
-    The page must be prepared. Attempts are those of
-    :func:`benchmarks.private_client.private_outcome`.
+    The page must be prepared. Attempts are those of :func:`benchmarks.people.attempt_all`.
     """
     counts = AttemptCounts()
     seconds: list[float] = []
@@ -179,14 +160,12 @@ def browser_outcome(
     for person in people:
         for name in opened.show(person.probes):
             answer = opened.call("verify", person.name, name)
-            counts.genuine += 1
-            counts.genuine_rejected += not accepted(answer)
+            counts.add(accepted(answer), genuine=True)
             if "accepted" in answer:
                 seconds.append(answer["seconds"])
     there = [person for person in people if person.name not in counts.refused_enrollments]
     for person, (photo,) in impostor_attempts(there, impostors):
-        counts.impostor += 1
-        counts.impostor_accepted += accepted(opened.call("attempt", person.name, photo.name))
+        counts.add(accepted(opened.call("attempt", person.name, photo.name)), genuine=False)
     return counts, seconds
 
 
@@ -364,27 +343,25 @@ def chromium(folder: Path, camera: FakeCamera) -> Iterator[BrowserContext]:
             context.close()
 
 
-def main() -> None:
-    """Run both clients and print their figures as JSON."""
-    parser = command_line(__doc__.splitlines()[0])
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    deployment.add_options(parser)
     parser.add_argument("--people", type=int, default=20)
-    args = parser.parse_args()
-    env = prepared(args) | {"VEILFACE_PACK": str(args.pack), "VEILFACE_SERVE_PACK": "true"}
+
+
+def measure(args: argparse.Namespace) -> list[dict[str, object]]:
+    """Return a row for each client, for each time and for what was sent."""
     people = people_of(args.data / "lfw" / "photos")[: args.people]
     expect.set_options(timeout=1000 * PATIENCE_S)
     impostors = len(people) - 1
-    pack = ModelPack.load(args.pack, threads=1)
-
     with ExitStack() as stack:
-        env["VEILFACE_DATABASE_URL"] = fresh_database(stack, args.work / "browser")
-        address = stack.enter_context(service(env, workers=1, log=args.work / "browser.log"))
-        key = key_of(env)
-        served = stack.enter_context(page_of(address, key, level=args.level))
-        camera = FakeCamera(args.work / "camera.mjpeg")
-        profile = args.work / "profile"
-        shutil.rmtree(profile, ignore_errors=True)
-        context = stack.enter_context(chromium(profile, camera))
-        load_before = os.getloadavg()[0]
+        service = stack.enter_context(deployment.running(args, serve_pack="true"))
+        pack = ModelPack.load(args.pack, threads=1)
+        key, level = service.token, args.level
+        served = stack.enter_context(page_of(service.url, key, level=level))
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        camera = FakeCamera(folder / "camera.mjpeg")
+        context = stack.enter_context(chromium(folder / "profile", camera))
         first = visit(context, served)
         downloaded = [first.call("prepare")]
         first.tab.page.close()
@@ -393,13 +370,12 @@ def main() -> None:
         browser, seconds = browser_outcome(opened, people, impostors=impostors)
         there = [each for each in people if each.name not in browser.refused_enrollments]
         by_camera, shown = before_the_camera(opened, camera, there)
-        recording = stack.enter_context(Proxy(int(address.rsplit(":", 1)[1])))
+        recording = stack.enter_context(Proxy(int(service.url.rsplit(":", 1)[1])))
         camera.shows(there[0].probes[0])
         looked, page_bytes = first_look(context, recording.url, key, there[0].name)
         looked.page.close()
         again, page_bytes_again = first_look(context, recording.url, key, there[0].name)
-        by_page = by_the_shutter(again, camera, there, level=args.level)
-        load_after = os.getloadavg()[0]
+        by_page = by_the_shutter(again, camera, there, level=level)
         sent = served.recording.sent + recording.sent
         calls, rest = requests_in(sent)
         search = faces_of(pack, people, shown)
@@ -411,64 +387,45 @@ def main() -> None:
         # Each tab has noted every request of the browser.
         here = (served.url, recording.url, "blob:", "data:")
         strays = sorted({each for each in first.tab.requests if not each.startswith(here)})
-        with PrivateClient(address, key, pack=args.pack, dim=args.probe_dim) as client:
-            python, _ = private_outcome(
-                client, people, level=args.level, impostors=impostors, at_once=1
-            )
+        with PrivateClient(service.url, key, pack=args.pack, dim=args.probe_dim) as client:
+            python = attempt_all(client, people, level=level, face="largest", impostors=impostors)
 
-    report = {
-        "pack": args.pack.name,
-        "strategy": args.strategy,
-        "m": args.dim,
-        "probe_m": args.probe_dim,
-        "level": args.level,
-        "people": len(people),
-        "javascript_client_in_chromium": browser.summary(),
-        "python_private_client": python.summary(),
-        "visits": [
-            {"bytes_downloaded": each["bytes"], "seconds_until_ready": round(each["seconds"], 2)}
-            for each in downloaded
-        ],
-        "photo_to_answer": _seconds(seconds),
-        "click_to_answer_by_the_element": _answered(by_camera),
-        "own_page_in_private_mode": {
-            "bytes_downloaded": [page_bytes, page_bytes_again],
-            "shutter_to_answer": _answered(by_page),
-            "of_which_until_the_photos_are_taken": _seconds(
-                [each["taken"] for each in by_page if each["error"] is None]
-            ),
+    def counts(outcome: AttemptCounts) -> str:
+        return ", ".join(f"{name} {value}" for name, value in outcome.row().items())
+
+    visits = [f"{each['bytes']:,} bytes in {each['seconds']:.2f} s" for each in downloaded]
+    figures: dict[str, object] = {
+        "JavaScript client in Chromium": counts(browser),
+        "Python private client": counts(python),
+        "until a lift can be made, first and second visit": "; ".join(visits),
+        "photo to answer": _seconds(seconds),
+        "click to answer, `<veilface-login>`": _answered(by_camera),
+        "shutter to answer, own page": _answered(by_page),
+        "own page, bytes of the first and second visit": f"{page_bytes:,}, {page_bytes_again:,}",
+        "sent": f"{len(sent):,} bytes; {rest} of no request; to other hosts: {strays or 'none'}",
+        **{
+            f"sent by {call}": f"{each['times']} times, {each['members']}, at most "
+            f"{each['bytes_of_a_body_at_most']} bytes"
+            for call, each in calls.items()
         },
-        "load_average_before_and_after": [round(load_before, 1), round(load_after, 1)],
-        "complaints_of_the_browser": complaints,
-        "sent": {
-            "bytes": len(sent),
-            "requests": calls,
-            "bytes_of_no_request": rest,
-            "to_other_hosts": strays,
-            "leaks": [f"{leak.what}: {leak.form}" for leak in leaks],
-            "planted_forms": len(PLANTED),
-            "planted_and_missed": missed,
-        },
+        "leaks": [f"{leak.what}: {leak.form}" for leak in leaks] or "none",
+        "sent on purpose and not found": missed or f"none of {len(PLANTED)}",
+        "complaints of the browser": complaints or "none",
     }
-    print(json.dumps(report, indent=2))
+    rows: list[dict[str, object]] = [{"": name, "seen": value} for name, value in figures.items()]
+    rows.append({"": "nothing of a face left", "verdict": "FAIL" if leaks or missed else "PASS"})
+    return rows
 
 
-def _answered(answers: Sequence[Mapping[str, Any]]) -> dict[str, object]:
+def _answered(answers: Sequence[Mapping[str, Any]]) -> str:
     answered = [each for each in answers if each["error"] is None]
-    return {
-        **_seconds([each["seconds"] for each in answered]),
-        "accepted": sum(each["accepted"] for each in answered),
-        "errors": [each["error"] for each in answers if each["error"] is not None],
-    }
+    errors = [each["error"] for each in answers if each["error"] is not None]
+    accepted = sum(each["accepted"] for each in answered)
+    times = _seconds([each["seconds"] for each in answered])
+    return f"{times}, accepted {accepted}, errors: {errors or 'none'}"
 
 
-def _seconds(seconds: Sequence[float]) -> dict[str, object]:
-    return {
-        "times": len(seconds),
-        "median_s": round(median(seconds), 2) if seconds else None,
-        "longest_s": round(max(seconds), 2) if seconds else None,
-    }
-
-
-if __name__ == "__main__":
-    main()
+def _seconds(seconds: Sequence[float]) -> str:
+    if not seconds:
+        return "never"
+    return f"{median(seconds):.2f} s (median of {len(seconds)}), at most {max(seconds):.2f} s"

@@ -7,12 +7,6 @@ own beside this one (`pip install --no-deps insightface requests tqdm`).
 Every photo is taken as it is, squeezed across, and squeezed downward. The package finds faces on
 one canvas; this program is compared by the same single pass, and by the whole way from the bytes
 of a photo, which differs where a face fills the picture.
-
-Example
--------
-::
-
-    python -m benchmarks.insightface_agreement --photos FOLDER --pack PACK --size 640
 """
 
 import argparse
@@ -34,26 +28,28 @@ from models.pack import ModelPack
 SQUEEZES = ((1.0, 1.0), (0.6, 1.0), (1.0, 0.55))  # across, downward
 
 
-def main() -> None:
-    """Print the worst and the median difference of each kind."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the args."""
     parser.add_argument("--photos", type=Path, required=True)
     parser.add_argument("--pack", type=Path, required=True, help="SCRFD and an embedder")
     parser.add_argument("--size", type=int, default=640)
     parser.add_argument("--every", type=int, default=1, help="take every n-th photo")
-    options = parser.parse_args()
+
+
+def measure(args: argparse.Namespace) -> list[dict[str, object]]:
+    """Return the worst and the median difference of each kind."""
     try:
         package = importlib.import_module("insightface")
     except ImportError:
         sys.exit("insightface is not installed in this environment: nothing was compared")
-    pack = ModelPack.load(options.pack, threads=1, detector_size=options.size)
-    detector, embedder = theirs(options.pack, pack, options.size)
+    pack = ModelPack.load(args.pack, threads=1, detector_size=args.size)
+    detector, embedder = theirs(args.pack, pack, args.size)
     align = importlib.import_module("insightface.utils.face_align").norm_crop
     points: list[float] = []
     grey: list[int] = []
     cosines: dict[str, list[float]] = {"one pass": [], "whole way": []}
     missed = pictures = 0
-    for path in sorted(options.photos.glob("*/*.jpg"))[:: options.every]:
+    for path in sorted(args.photos.glob("*/*.jpg"))[:: args.every]:
         photo = decode_image(path.read_bytes())
         for across, down in SQUEEZES:
             image = squeezed(photo, across, down)
@@ -75,12 +71,21 @@ def main() -> None:
             cosines["one pass"].append(float(right @ pack.embed(ours[None])[0]))
             sample = pack.embed_photo(png(image), policy=None, quality=None)
             cosines["whole way"].append(float(right @ sample.embedding))
-    print(f"insightface {package.__version__}, canvas {options.size}: {pictures} pictures,")
-    print(f"no face in {missed} (by both); key points differ by at most {max(points):.2g} pixels,")
-    print(f"crops by {max(grey)} grey levels; cosine of the embeddings, least and median:")
-    for name, values in cosines.items():
-        below = sum(value < 0.9999 for value in values)
-        print(f"{name}: {min(values):.7f} {np.median(values):.7f}, below 0.9999: {below}")
+    return [
+        {
+            "insightface": package.__version__,
+            "canvas": args.size,
+            "pictures": pictures,
+            "no face, by both": missed,
+            "key points, at most, pixels": f"{max(points):.2g}",
+            "crops, at most, grey levels": max(grey),
+            "embeddings by": name,
+            "least cosine": f"{min(values):.7f}",
+            "median": f"{np.median(values):.7f}",
+            "below 0.9999": sum(value < 0.9999 for value in values),
+        }
+        for name, values in cosines.items()
+    ]
 
 
 def theirs(folder: Path, pack: ModelPack, size: int) -> tuple[Any, Any]:
@@ -105,7 +110,3 @@ def png(image: NDArray[np.uint8]) -> bytes:
     file = io.BytesIO()
     Image.fromarray(image).save(file, "PNG", compress_level=1)
     return file.getvalue()
-
-
-if __name__ == "__main__":
-    main()

@@ -3,18 +3,12 @@
 People of LFW are parted by chance into a sample that decoys are adapted to, people to choose axes
 and dimension by, and people to judge. Decoys are fitted to FairFace, UTKFace and All-Age-Faces. The
 attackers have all other photos of LFW. The last rows have nobody's photos: decoys, thresholds and
-privacy of FairFace alone, and the accuracy of LFW beside.
-
-Example
--------
-::
-
-    python -m benchmarks.operating_point --data ../shared/data
-    python -m benchmarks.operating_point --spared 600 --splits 0
+privacy of FairFace alone, and the accuracy of LFW beside. Theft is in % with its one-sided bound;
+false non-matches are in % at FMR 1e-3 / 1e-4, of photos shown to photos enrolled.
 """
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePath
 
@@ -160,31 +154,28 @@ def rejected(contract: Contract, *, enrolled: int, shown: int, lifted: bool = Fa
     return " / ".join(parts)
 
 
-def show(name: str, number: int, point: OperatingPoint, contract: Contract) -> None:
-    """Print one row of the table."""
+def row_of(name: str, number: int, point: OperatingPoint, contract: Contract) -> dict[str, object]:
+    """One row of the table."""
     privacy = point.privacy
-    size = 2 * point.axes * (point.dim + 1) / 1000
-    columns = (
-        name,
-        str(number),
-        f"{point.axes}, {point.dim}",
-        f"{100 * privacy.rate.value:.2g} ({privacy.rate.errors}/{privacy.rate.trials}), "
+    return {
+        "spared": name,
+        "split": number,
+        "axes, m": f"{point.axes}, {point.dim}",
+        "theft": f"{100 * privacy.rate.value:.2g} ({privacy.rate.errors}/{privacy.rate.trials}), "
         f"≤ {100 * (privacy.upper or 1):.2g}",
-        f"{privacy.basis['attacker_faces']}, {privacy.basis['counted']}",
-        privacy.status,
-        rejected(contract, enrolled=3, shown=1),
-        rejected(contract, enrolled=1, shown=1),
-        rejected(contract, enrolled=3, shown=2),
-        rejected(contract, enrolled=3, shown=3),
-        rejected(contract, enrolled=3, shown=1, lifted=True),
-        f"{size:.0f}",
-    )
-    print("| " + " | ".join(columns) + " |", flush=True)
+        "strongest attacker": f"{privacy.basis['attacker_faces']}, {privacy.basis['counted']}",
+        "privacy": privacy.status,
+        "1 to 3": rejected(contract, enrolled=3, shown=1),
+        "1 to 1": rejected(contract, enrolled=1, shown=1),
+        "2 to 3": rejected(contract, enrolled=3, shown=2),
+        "3 to 3": rejected(contract, enrolled=3, shown=3),
+        f"lifted, m = {PROBE_M}": rejected(contract, enrolled=3, shown=1, lifted=True),
+        "kB": f"{2 * point.axes * (point.dim + 1) / 1000:.0f}",
+    }
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Measure, and print a table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options."""
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
     parser.add_argument("--pack", choices=sorted(SETS), default="w600k_mbf")
     parser.add_argument("--spared", type=int, nargs="*", default=[100, 300, 600, 1200, 2400])
@@ -192,39 +183,34 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--victims", type=int, default=400, help="to judge; as many to choose by")
     parser.add_argument("--no-alone", dest="alone", action="store_false")
     parser.add_argument("--embeddings", type=Path, help="of the crops, embedded before")
-    given = parser.parse_args(arguments)
-    people = lfw(given.data, given.pack, given.embeddings)
-    sets = [stored(given.data, name, given.pack)[0] for name in FACES]
+
+
+def measure(args: argparse.Namespace) -> list[dict[str, object]]:
+    """Return a row for each number of spared photos and each split."""
+    people = lfw(args.data, args.pack, args.embeddings)
+    sets = [stored(args.data, name, args.pack)[0] for name in FACES]
     many = np.concatenate(sets)
-    print(f"{len(people.rows):,} photos of LFW, {len(many):,} faces; theft in % (one-sided bound);")
-    print("false non-matches in % at FMR 1e-3 / 1e-4, of photos shown to photos enrolled\n")
-    head = (
-        "spared | split | axes, m | theft | strongest attacker | verdict | 1 to 3 | 1 to 1 | "
-        "2 to 3 | 3 to 3 | lifted, m = 4 | kB"
-    )
-    print(f"| {head} |\n|{'---|' * 12}")
+    rows = []
     with single_threaded():
-        for spared in given.spared:
-            for number in given.splits:
+        for spared in args.spared:
+            for number in args.splits:
                 rng = np.random.default_rng([spared, number])
-                sample, by, judged, others = split(people, spared, given.victims, rng)
+                sample, by, judged, others = split(people, spared, args.victims, rng)
                 names = [str(one) for one in sample.person]
                 source = DecoyGenerator.adapt(many, sample.rows, names)
                 rest = People(
                     np.concatenate([judged.rows, others.rows]),
                     np.concatenate([judged.person, others.person]),
                 )
-                show(f"{spared:,}", number, *measured(source, by, judged, others, rest, rng))
-        for number in given.splits if given.alone else ():
+                point, contract = measured(source, by, judged, others, rest, rng)
+                rows.append(row_of(f"{spared:,}", number, point, contract))
+        for number in args.splits if args.alone else ():
             rng = np.random.default_rng([7, number])
             order = rng.permutation(len(sets[0]))
             strangers = People(sets[0][order[:2_400]], np.arange(2_400))
-            group = np.minimum(strangers.person // given.victims, 2)
+            group = np.minimum(strangers.person // args.victims, 2)
             by, judged, others = (strangers[group == part] for part in range(3))
             source = DecoyGenerator.fit(sets[0][order[2_400:7_400]])
-            row = measured(source, by, judged, others, people, rng)
-            show("FairFace alone", number, *row)
-
-
-if __name__ == "__main__":
-    main()
+            point, contract = measured(source, by, judged, others, people, rng)
+            rows.append(row_of("FairFace alone", number, point, contract))
+    return rows

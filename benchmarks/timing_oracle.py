@@ -13,37 +13,19 @@ slower answer "enrolled" (the Mann-Whitney statistic over n²), with a 95 % inte
 variance. 0.5 is guessing. The verdict is "indistinguishable" where the whole interval lies within
 0.47 to 0.53, "distinguishable" where it does not contain 0.5, and "undecided" otherwise. The
 figures of the first and of the second half stand beside it, because a machine drifts.
-
-Example
--------
-::
-
-    python -m benchmarks.timing_oracle --work FOLDER --pairs 4000   # a folder of service_load
 """
 
 import argparse
-import base64
-import json
-import os
 import time
-from contextlib import ExitStack
-from pathlib import Path
-from typing import Any
 
 import httpx
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.deployment import database, service, settings_of, veilface
-from benchmarks.end_to_end import (
-    UNLIMITED,
-    enroll_photos,
-    people_of,
-    prepare,
-    with_clear_faces,
-)
-from benchmarks.service_load import BOUNDARY, Prepared, prepared_probes
+from benchmarks import deployment
+from benchmarks.people import KINDS, Request, clear_people, requests_of
 from models.pack import ModelPack
+from veilface_client import Client, new_holder_key
 
 BOUND = 0.03
 COMPARED = {
@@ -53,6 +35,14 @@ COMPARED = {
     "needs a key, none was sent": ("no key", "unknown"),
     "enrolled, a key was sent": ("enrolled, key", "unknown, key"),
 }
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    deployment.add_options(parser)
+    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS))
+    parser.add_argument("--pairs", type=int, default=4000)
+    parser.add_argument("--seed", type=int, default=0)
 
 
 def auc(slow: NDArray[np.float64], fast: NDArray[np.float64]) -> tuple[float, float, float]:
@@ -74,116 +64,79 @@ def auc(slow: NDArray[np.float64], fast: NDArray[np.float64]) -> tuple[float, fl
     return area, area - 1.96 * float(spread), area + 1.96 * float(spread)
 
 
-def compare(known: NDArray[np.float64], unknown: NDArray[np.float64]) -> dict[str, Any]:
+def compare(known: NDArray[np.float64], unknown: NDArray[np.float64]) -> dict[str, object]:
     """The figures of one kind of probe."""
     area, low, high = auc(known, unknown)
     if low >= 0.5 - BOUND and high <= 0.5 + BOUND:
-        verdict = "indistinguishable"
+        conclusion = "indistinguishable"
     else:
-        verdict = "undecided" if low <= 0.5 <= high else "distinguishable"
+        conclusion = "undecided" if low <= 0.5 <= high else "distinguishable"
     half = len(known) // 2
+    halves = (auc(known[part], unknown[part])[0] for part in (slice(half), slice(half, None)))
     return {
         "pairs": len(known),
-        "median_ms_enrolled": round(1000 * float(np.median(known)), 3),
-        "median_ms_unknown": round(1000 * float(np.median(unknown)), 3),
-        "auc": round(area, 4),
-        "auc_95": [round(low, 4), round(high, 4)],
-        "auc_first_half": round(auc(known[:half], unknown[:half])[0], 4),
-        "auc_second_half": round(auc(known[half:], unknown[half:])[0], 4),
-        "verdict": verdict,
+        "median known, ms": f"{1000 * float(np.median(known)):.3f}",
+        "median unknown, ms": f"{1000 * float(np.median(unknown)):.3f}",
+        "AUC": f"{area:.4f} ({low:.4f}-{high:.4f})",
+        "of the halves": ", ".join(f"{value:.4f}" for value in halves),
+        "conclusion": conclusion,
     }
 
 
-def ask(
-    client: httpx.Client, token: str, subject: str, probe: Prepared, key: str | None = None
-) -> float:
-    """Seconds until the answer, which must be a rejection."""
-    headers = {"Authorization": f"Bearer {token}", "Content-Type": probe.content_type}
-    body = probe.body if key is None else with_key(probe, key)
-    started = time.perf_counter()
-    answer = client.post(f"/v1/subjects/{subject}/verify", content=body, headers=headers)
-    took = time.perf_counter() - started
-    if answer.status_code != 200 or answer.json()["decision"] != "reject":
-        raise SystemExit(f"not a rejection: {answer.text}")
-    return took
-
-
-def with_key(probe: Prepared, key: str) -> bytes:
-    """Return the body of a probe with a holder's key as its first field."""
-    if probe.kind != "photo":
-        return b'{"holder_key": "' + key.encode() + b'", ' + probe.body.lstrip()[1:]
-    field = f'--{BOUNDARY}\r\nContent-Disposition: form-data; name="holder_key"\r\n\r\n{key}\r\n'
-    return field.encode() + probe.body
-
-
-def main() -> None:
-    """Ask, and print the figures as JSON."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, default=Path("../shared/data"))
-    parser.add_argument("--pack", type=Path, help="default: DATA/packs/w600k_mbf")
-    parser.add_argument("--work", type=Path, required=True, help="keeps decoys and contract")
-    parser.add_argument("--kind", default="embedding,template,photo")
-    parser.add_argument("--pairs", type=int, default=4000)
-    parser.add_argument("--database", choices=["sqlite", "postgresql"], default="sqlite")
-    parser.add_argument("--dim", type=int, default=64)
-    parser.add_argument("--probe-dim", type=int, default=8)
-    parser.add_argument("--seed", type=int, default=0)
-    args = parser.parse_args()
-    args.pack = args.pack or args.data / "packs" / "w600k_mbf"
-    args.cache, args.pool, args.strategy = None, False, "adversarial"
+def measure(args: argparse.Namespace) -> list[dict[str, object]]:
+    """Return a row for each kind of probe and each case."""
     rng = np.random.default_rng(args.seed)
-    args.work.mkdir(parents=True, exist_ok=True)
-    with ExitStack() as stack:
-        url = stack.enter_context(database(args.database, args.work))
-        env = os.environ | settings_of(args.work, args.pack, url) | UNLIMITED
-        if not (args.work / "contract.json").exists():
-            prepare(args, args.work, env)
-        rights = [x for r in ("enroll", "verify", "embeddings") for x in ("--right", r)]
-        token = json.loads(veilface("keys", "create", "--json", *rights, env=env))["token"]
-        outsider = [x for r in ("verify", "embeddings") for x in ("--right", r)]
-        asking = json.loads(veilface("keys", "create", "--json", *outsider, env=env))["token"]
-        address = stack.enter_context(service(env, workers=1, log=args.work / "serve.log"))
-        client = stack.enter_context(httpx.Client(base_url=address, timeout=60))
-        client.headers["Authorization"] = f"Bearer {token}"
+    rows: list[dict[str, object]] = []
+    with deployment.running(args) as service, service.http() as http:
         pack = ModelPack.load(args.pack, threads=1)
-        stranger, *people = with_clear_faces(people_of(args.data / "lfw" / "photos"), pack)
+        stranger, *people = clear_people(args, pack)
         half = len(people) // 2
-        victims, keyed = people[:half], people[half : 2 * half]
-        right, other = (base64.urlsafe_b64encode(os.urandom(32)).decode() for _ in range(2))
-        for person in victims:
-            enroll_photos(client, person, None).raise_for_status()
-        for person in keyed:
-            enroll_photos(client, person, None, holder_key=right).raise_for_status()
-        enrolled = [person.name for person in victims]
-        needing_key = [person.name for person in keyed]
+        right, other = new_holder_key(), new_holder_key()
+        with Client(service.url, service.token) as client:
+            for person in people[:half]:
+                client.enroll(person.name, person.enroll)
+            for person in people[half : 2 * half]:
+                client.enroll(person.name, person.enroll, holder_key=right)
+        # A key without `enroll` is not told who is not enrolled.
+        outsider = deployment.key_of(service.env, "verify", "embeddings")
+        http.headers["Authorization"] = f"Bearer {outsider}"
+        enrolled = [person.name for person in people[:half]]
+        keyed = [person.name for person in people[half : 2 * half]]
         unknown = ["x" + name[1:] for name in enrolled]
-        cases: dict[str, tuple[list[str], str | None]] = {
+        cases: dict[str, tuple[list[str], bytes | None]] = {
             "enrolled": (enrolled, None),
             "enrolled, key": (enrolled, other),
             "unknown": (unknown, None),
             "unknown, key": (unknown, other),
-            "other key": (needing_key, other),
-            "right key": (needing_key, right),
-            "no key": (needing_key, None),
+            "other key": (keyed, other),
+            "right key": (keyed, right),
+            "no key": (keyed, None),
         }
-        report: dict[str, Any] = {"database": args.database, "lockout": "off", "kinds": {}}
-        for kind in args.kind.split(","):
-            probe = prepared_probes(kind, [stranger], client, pack, args.probe_dim)[0]
+        for kind in args.kinds:
+            probe = requests_of(kind, [stranger], args, service.url, service.token)[0]
             for subjects, key in cases.values():
                 for subject in subjects:
-                    ask(client, asking, subject, probe, key)
+                    ask(http, subject, probe, key)
             times = {case: np.empty(args.pairs) for case in cases}
             for turn in range(args.pairs):
                 for case in rng.permutation(list(cases)):
                     subjects, key = cases[case]
-                    subject = subjects[turn % len(subjects)]
-                    times[case][turn] = ask(client, asking, subject, probe, key)
-            report["kinds"][kind] = {
-                name: compare(times[known], times[beside])
+                    times[case][turn] = ask(http, subjects[turn % len(subjects)], probe, key)
+            rows += [
+                {"probe": kind, "case": name, **compare(times[known], times[beside])}
                 for name, (known, beside) in COMPARED.items()
-            }
-    print(json.dumps(report, indent=2))
+            ]
+    return rows
 
 
-if __name__ == "__main__":
-    main()
+def ask(http: httpx.Client, subject: str, probe: Request, key: bytes | None) -> float:
+    """Seconds until the answer, which must be a rejection."""
+    request = Request(subject, probe.content_type, probe.body)
+    if key is not None:
+        request = request.with_key(key)
+    started = time.perf_counter()
+    answer = request.send(http)
+    took = time.perf_counter() - started
+    if answer.status_code != 200 or answer.json()["decision"] != "reject":
+        raise SystemExit(f"not a rejection: {answer.text}")
+    return took

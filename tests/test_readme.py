@@ -13,7 +13,7 @@ import httpx
 import numpy as np
 import pytest
 
-from benchmarks.readme_results import merged, read_results, readme_table, written_into
+from benchmarks.readme_results import readme_table, written_into
 from models.errors import FaceError
 from models.pack import ModelPack
 from models.quality import QualityLimits
@@ -151,14 +151,14 @@ def test_the_evaluation_on_a_part_of_lfw(
     shell(with_values(block, {"PACK": str(mbf_pack_dir), "LFW": str(lfw)}), folder, env)
     results = json.loads((folder / "lfw-results" / "results.json").read_text())
     assert results["datasets"][0]["pairs"] == 120
-    table = readme_table(results)
+    table = readme_table([results])
     assert "120 pairs of LFW" in table
     assert "| adversarial (generator)" in table
 
 
 def test_the_results_table_is_that_of_the_results_in_the_repository() -> None:
-    kept = [ROOT / "docs" / "results" / name for name in KEPT]
-    results = merged([read_results(path) for path in kept])
+    folder = ROOT / "docs" / "results"
+    results = [json.loads((folder / name).read_text(encoding="utf-8")) for name in KEPT]
     text = EVALUATION.read_text(encoding="utf-8")
     assert written_into(text, readme_table(results)) == text
 

@@ -10,9 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.deployment import service as serve
 from tests.api.deployment import Deployment, deploy, environment_of
-from tests.ports import free_port
+from tests.serving import serve
 
 VEILFACE = Path(sys.executable).with_name("veilface")
 
@@ -40,7 +39,7 @@ def started(deployment: Deployment, folder: Path) -> Iterator[Running]:
     """``veilface serve`` as a process of its own."""
     ours = {name: value for name, value in os.environ.items() if not name.startswith("VEILFACE_")}
     env = ours | environment_of(deployment.settings) | {"OMP_NUM_THREADS": "1"}
-    with serve(env, workers=1, log=folder / "serve.log", port=free_port()) as url:
+    with serve(env, folder / "serve.log") as (url, _):
         yield Running(url, deployment)
 
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.deployment import service
 from models.demo import build_demo_pack
 from tests.api.cli.conftest import draw
+from tests.serving import serve
 from tests.test_readme import BLOCKS, with_values
 from veilface_client import Client, PrivateClient
 
@@ -46,7 +46,7 @@ def test_who_is_enrolled_by_photos_is_verified_without_sending_one(tmp_path: Pat
         "VEILFACE_PACK": str(pack),
         "VEILFACE_DATA_DIR": str(tmp_path / "veilface-data"),
     }
-    with service(serving, workers=1, log=tmp_path / "serve.log") as url:
+    with serve(serving, tmp_path / "serve.log") as (url, _):
         with Client(url, key) as client:
             client.enroll("anna", photos[:3])
         with PrivateClient(url, lifting, pack=pack) as client:

@@ -13,7 +13,7 @@ import pytest
 from playwright.sync_api import Browser, Page, Route, expect
 
 from benchmarks.browser_client import faces_of, requests_in
-from benchmarks.end_to_end import Person
+from benchmarks.people import Person
 from models.pack import ModelPack
 from tests.clients.conftest import Running
 from tests.clients.javascript.conftest import PACKAGE, require_client

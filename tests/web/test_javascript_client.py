@@ -23,7 +23,7 @@ from benchmarks.browser_client import (
     requests_in,
 )
 from benchmarks.browser_client import visit as open_page
-from benchmarks.end_to_end import Person
+from benchmarks.people import Person
 from models.pack import ModelPack
 from tests.clients.conftest import Running
 from tests.clients.javascript.conftest import require_client

@@ -10,7 +10,7 @@ import pytest
 from playwright.sync_api import Page, Route, expect
 
 from benchmarks.browser_client import faces_of, requests_in
-from benchmarks.end_to_end import Person
+from benchmarks.people import Person
 from models.pack import ModelPack
 from tests.clients.conftest import Running
 from tests.clients.javascript.conftest import require_client

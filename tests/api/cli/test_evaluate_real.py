@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from sklearn.model_selection import KFold
 
-from benchmarks.readme_results import BEGIN, END, main, read_results, readme_table
 from models.decoding import decode_image
 from models.pack import ModelPack
 from models.synthetic import encode_photo
@@ -172,49 +171,6 @@ def test_a_bin_of_the_crops_gives_identical_numbers(part: Part, tmp_path: Path) 
     for block in ("rows", "runs", "curves"):
         wanted = [row for row in part.ran.json[block] if row["strategy"] != "raw+flip"]
         assert numbers(ran.json[block]) == numbers(wanted)
-
-
-def test_the_readme_table_has_the_numbers_of_the_results(part: Part, tmp_path: Path) -> None:
-    results = read_results(part.out / "results.json")
-    block = readme_table(results)
-    lines = [
-        [cell.strip() for cell in line.strip("|").split("|")]
-        for line in block.splitlines()
-        if line.startswith("|")
-    ]
-    assert lines[0] == ["lifting (decoys)", "matching", *(f"m = {dim}" for dim in DIMS)]
-    labels = {"random": ("random", None), "adversarial (pool)": ("adversarial", "pool")}
-    assert [tuple(line[:2]) for line in lines[2:]] == [
-        (label, mode) for mode in ("p-to-s", "s-to-s") for label in labels
-    ]
-    for label, mode, *cells in lines[2:]:
-        for dim, cell in zip(DIMS, cells, strict=True):
-            (row,) = (
-                each
-                for each in results["rows"]
-                if (each["strategy"], each["decoys"]) == labels[label]
-                and (each["dim"], each["metric"]) == (dim, "spherical")
-                and each["mode"] == mode.replace("-to-", "2")
-            )
-            spread = row["accuracy_std_seeds"]
-            wanted = f"{100 * row['accuracy_mean']:.2f}"
-            assert cell == (f"{wanted} ± {100 * spread:.2f}" if spread is not None else wanted)
-    (raw,) = (
-        each
-        for each in results["rows"]
-        if (each["strategy"], each["threshold_search"]) == ("raw", "exact")
-    )
-    half = FOLDS * PER_CLASS
-    assert f"Raw embeddings: {100 * raw['accuracy_mean']:.2f} %" in block
-    assert (
-        f"on the {2 * half} pairs of LFW ({half} genuine and {half} impostor compared), w600k_mbf"
-        in block
-    )
-    assert "mean of 2 seeds" in block
-    readme = tmp_path / "README.md"
-    readme.write_text(f"before\n{BEGIN}\n{END}\nafter\n", encoding="utf-8")
-    assert main([str(part.out / "results.json"), "--write", str(readme)]) == 0
-    assert readme.read_text(encoding="utf-8") == f"before\n{BEGIN}\n{block}\n{END}\nafter\n"
 
 
 def test_photos_are_detected_and_one_without_a_face_is_listed(

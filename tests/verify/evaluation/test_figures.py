@@ -77,7 +77,7 @@ def test_a_figure_without_content_is_left_out(tmp_path: Path) -> None:
 
 def test_only_the_figures_import_matplotlib_and_never_pyplot() -> None:
     code = (
-        "import sys; import verify.evaluation.tables, benchmarks.readme_results; "
+        "import sys; import verify.evaluation.tables; "
         "assert 'matplotlib' not in sys.modules; "
         "import verify.evaluation.figures; assert 'matplotlib.pyplot' not in sys.modules"
     )
