@@ -2,10 +2,8 @@
 
 import functools
 from pathlib import Path
-from typing import Any
 
 from alembic import command
-from alembic.autogenerate import compare_metadata
 from alembic.config import Config
 from alembic.runtime.migration import MigrationContext
 from alembic.script import ScriptDirectory
@@ -13,7 +11,6 @@ from sqlalchemy.engine import Connection
 
 from templates.errors import StoreError
 from templates.store.database import Database
-from templates.store.schema import Base
 
 
 def upgrade(database: Database) -> None:
@@ -57,16 +54,6 @@ def check(database: Database) -> None:
             f"the database is at schema {present}, this program needs {head_revision()}: "
             "run `veilface db upgrade`"
         )
-
-
-def differences(database: Database) -> list[Any]:
-    """What the tables of the database and the mapped classes do not agree on."""
-    return database.read(
-        lambda connection: compare_metadata(
-            MigrationContext.configure(connection, opts={"compare_server_default": True}),
-            Base.metadata,
-        )
-    )
 
 
 def _revision_of(connection: Connection) -> str | None:
