@@ -207,7 +207,7 @@ def requests_of(
                     made.append(Request(person.name, content, _form(data, args.level)))
                     continue
                 if kind == "template":
-                    template = client.lift(data).template
+                    template = client.lift(data, face="dominant").template
                     fields: dict[str, Any] = {"template": base64.b64encode(template).decode()}
                 else:
                     fields = {"embedding": pack.embed_photo(data).embedding.tolist()}
