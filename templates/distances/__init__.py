@@ -14,7 +14,7 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, DTypeLike, NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from templates.distances import exact
 from templates.distances.metric import (
@@ -24,7 +24,6 @@ from templates.distances.metric import (
     Metric,
     Neighbours,
     Probes,
-    Progress,
     Tile,
     similarity,
 )
@@ -37,7 +36,6 @@ __all__ = [
     "Metric",
     "Neighbours",
     "Probes",
-    "count_within",
     "nearest",
     "on_device",
     "paired_distances",
@@ -149,7 +147,6 @@ def nearest(
     of_templates: bool = False,
     labels: Labels | None = None,
     threads: int | None = None,
-    progress: Progress | None = None,
 ) -> Neighbours:
     """Find the K nearest templates of every probe, without the matrix of all distances.
 
@@ -163,8 +160,6 @@ def nearest(
         Find the K nearest probes of every template instead.
     labels : pair of ndarray of int64, shapes (P,) and (T,), optional
         Pairs with equal labels are passed over.
-    progress
-        Called with numbers of pairs that are done; on a device once, with all of them.
 
     Returns
     -------
@@ -188,72 +183,14 @@ def nearest(
         keys <<= 32
         if labels is not None:
             keys[labels[0][rows, None] == labels[1][columns]] = _NOTHING
-        done = keys.size
         if of_templates:
             rows, columns, keys = columns, rows, keys.T
         keys = np.concatenate([best[rows], keys | np.arange(columns.start, columns.stop)], axis=1)
         best[rows] = np.partition(keys, k - 1, axis=1)[:, :k]
-        if progress is not None:
-            progress(done)
     best.sort(axis=1)
     nothing = best == _NOTHING
     nearby = (best >> 32).astype(np.int32).view(np.float32)
     return Neighbours(np.where(nothing, -1, best & 0xFFFFFFFF), np.where(nothing, np.inf, nearby))
-
-
-def count_within(
-    probes: Probes,
-    templates: SubspaceBatch,
-    thresholds: ArrayLike,
-    *,
-    metric: Metric | str,
-    steps: int = DEFAULT_STEPS,
-    labels: Labels | None = None,
-    threads: int | None = None,
-    progress: Progress | None = None,
-) -> NDArray[np.int64]:
-    """Count the pairs up to every threshold, without the matrix of all distances.
-
-    With the labels of people, the counts over the number of pairs of different people are the
-    FMR at every threshold.
-
-    Parameters
-    ----------
-    probes, templates, metric, steps, labels, threads, progress
-        As of `nearest`.
-    thresholds : array_like of float, shape (S,)
-        In any order.
-
-    Returns
-    -------
-    ndarray of int64, shape (S,)
-        Number of pairs with distance <= threshold, of different labels where there are labels.
-
-    Raises
-    ------
-    InvalidEmbedding, InvalidTemplate, TemplateError
-        As of `pairwise_distances`; a threshold that is not a number.
-    """
-    limits = np.atleast_1d(np.asarray(thresholds, dtype=np.float64))
-    if limits.ndim != 1 or not limits.size or np.isnan(limits).any():
-        raise TemplateError("thresholds are a row of numbers")
-    labels = _labels(labels, probes, templates)
-    probes = _checked(probes, templates, np.float32)
-    order = np.argsort(limits)
-    ascending = limits[order]
-    counts = np.zeros(len(limits), dtype=np.int64)
-    for rows, columns, distances in _tiles(probes, templates, metric, steps, np.float32, threads):
-        within = distances <= ascending[-1]
-        if labels is not None:
-            within &= labels[0][rows, None] != labels[1][columns]
-        # In float64, so that a threshold between two float32 numbers separates them.
-        first = np.searchsorted(ascending, distances[within].astype(np.float64))
-        counts += np.bincount(first, minlength=len(counts))
-        if progress is not None:
-            progress(distances.size)
-    out = np.empty_like(counts)
-    out[order] = np.cumsum(counts)
-    return out
 
 
 def paired_distances(

@@ -1,6 +1,5 @@
 """What every part of the package speaks of: metrics, steps, neighbours, labels."""
 
-from collections.abc import Callable
 from enum import StrEnum
 from typing import Any, NamedTuple, TypeVar
 
@@ -33,9 +32,6 @@ Tile = tuple[slice, slice, Floats]
 
 Labels = tuple[Indices, Indices]
 """One label for each probe and each template; pairs with equal labels do not count."""
-
-Progress = Callable[[int], None]
-"""Called with numbers of pairs that are done."""
 
 
 class Metric(StrEnum):

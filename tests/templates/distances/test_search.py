@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from templates import distances
 from templates.distances import (
     Metric,
-    count_within,
     exact,
     nearest,
     on_device,
@@ -74,7 +73,6 @@ def test_nearest_is_what_sorting_the_matrix_finds(name: str, data: st.DataObject
         tags = np.arange(probes) % labels, np.arange(count) % 3
         table = np.where(tags[0][:, None] == tags[1], np.inf, table)
     expected = sorted_matrix(table.T if of_templates else table, k)
-    done: list[int] = []
     found = nearest(
         left,
         right,
@@ -82,31 +80,11 @@ def test_nearest_is_what_sorting_the_matrix_finds(name: str, data: st.DataObject
         metric=metric,
         of_templates=of_templates,
         labels=tags,
-        progress=done.append,
     )
-    assert sum(done) == probes * count
     np.testing.assert_allclose(found.distances, expected.distances, rtol=0, atol=5e-6)
     assert ((found.indices < 0) == (expected.indices < 0)).all()
     if name != "torch":  # whose products of equal rows may differ in the last bit
         np.testing.assert_array_equal(found.indices, expected.indices)
-
-
-@pytest.mark.parametrize("metric", METRICS)
-def test_counts_are_those_of_the_matrix(name: str, metric: str) -> None:
-    templates = faces(70, 4, seed=2, n=64)
-    points = units(Keystream.seeded(4), 50, 64).astype(np.float32)
-    for probes in (points, faces(50, 3, seed=3, n=64)):
-        table = pairwise_distances(probes, templates, metric=metric)
-        people = np.arange(50) // 2, np.arange(70) // 3
-        thresholds = np.concatenate([np.quantile(table, [0.5, 0.01]), [-1.0, 0.0, 9.0, np.inf]])
-        seen = count_within(probes, templates, thresholds, metric=metric)
-        np.testing.assert_array_equal(seen, [(table <= t).sum() for t in thresholds])
-        others = people[0][:, None] != people[1]
-        seen = count_within(probes, templates, thresholds, metric=metric, labels=people)
-        np.testing.assert_array_equal(seen, [(table <= t)[others].sum() for t in thresholds])
-        one = table[5, 5].astype(np.float64)
-        between = count_within(probes, templates, one - 1e-12, metric=metric)
-        assert between == count_within(probes, templates, one, metric=metric) - 1
 
 
 def test_nothing_in_nothing_out(name: str) -> None:
@@ -120,21 +98,15 @@ def test_nothing_in_nothing_out(name: str) -> None:
         assert found.indices.shape == found.distances.shape == (0, 2)
         found = nearest(none, templates, k=2, metric=metric, of_templates=True)
         assert (found.indices == -1).all()
-        assert count_within(none, templates, [1.0], metric=metric) == 0
 
 
 @pytest.mark.parametrize(
     ("call", "message"),
     [
         (lambda t: nearest(t, t, k=0, metric="euclidean"), "at least 1"),
-        (lambda t: count_within(t, t, [[1.0]], metric="euclidean"), "a row of numbers"),
-        (lambda t: count_within(t, t, [np.nan], metric="euclidean"), "a row of numbers"),
-        (lambda t: count_within(t, t, [], metric="euclidean"), "a row of numbers"),
         (lambda t: nearest(t, t, k=1, metric="euclidean", threads=0), "at least 1 is needed"),
         (
-            lambda t: count_within(
-                t, t, [1.0], metric="euclidean", labels=(np.arange(3), np.arange(4))
-            ),
+            lambda t: nearest(t, t, k=1, metric="euclidean", labels=(np.arange(3), np.arange(4))),
             "do not fit 4 probes and 4 templates",
         ),
         (
@@ -167,20 +139,6 @@ def test_threads_and_neighbours_do_not_change_a_distance(metric: str) -> None:
             np.testing.assert_allclose(other, alone, rtol=0, atol=2e-6)
         one = matrix("compiled", probes[7:8], b[31:32], metric=metric)
         assert one[0, 0] == pytest.approx(alone[7, 31], abs=2e-6)
-
-
-def test_a_failure_of_the_caller_ends_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
-    from templates.distances import compiled
-
-    monkeypatch.setattr(compiled, "_TASK_PAIRS", 16)
-    monkeypatch.setattr(distances, "_FEW", 0)
-    templates = faces(200, 3, seed=1, n=64)
-
-    def progress(count: int) -> None:
-        raise InterruptedError
-
-    with pytest.raises(InterruptedError):
-        nearest(templates, templates, k=1, metric="euclidean", threads=2, progress=progress)
 
 
 # --- who computes ------------------------------------------------------------------------------
