@@ -18,8 +18,8 @@ square, and by 8·10⁻⁵ at most over 400,000 pairs: as much as the first roun
 moves the distance is 2.6·10⁻⁵ from that to the template before any rounding.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import sqlalchemy as sa
@@ -32,22 +32,13 @@ from templates.keys.rotation import TenantRotation
 from templates.keys.sealing import sealed_key_id
 from templates.store.audit_log import PROGRAM, By, Entry
 from templates.store.context import StoreContext
-from templates.store.envelope import Owner, close_envelope
+from templates.store.envelope import close_envelope
 from templates.store.schema import RotationKeyRow, SubjectRow, TemplateRow, TenantRow
 from templates.store.subject_rows import TEMPLATE_COLUMNS, opened_template, owner_of
 from templates.store.tenants import RetiredRotation, Tenant, Tenants, tenant_of
 
 ACTION = "tenant-rotate"
-BATCH = 50
-
-
-@dataclass(frozen=True)
-class _Rotated:
-    """A template in the new epoch, and the row that it replaces."""
-
-    row: Any = field(repr=False)
-    owner: Owner
-    wire: bytes = field(repr=False)
+BATCH = 10
 
 
 class Rerotation:
@@ -89,9 +80,8 @@ class Rerotation:
     ) -> int:
         """Bring stored templates of older epochs into the current one; returns how many.
 
-        Template id, metadata and times stay; the data key is a new one. A subject that is enrolled
-        or erased meanwhile is left as it is. It may be interrupted, run again, and run by several
-        processes at once.
+        Template id, metadata and times stay; the data key is a new one. It may be interrupted, run
+        again, and run by several processes at once, beside a service in use.
 
         Parameters
         ----------
@@ -101,7 +91,7 @@ class Rerotation:
             Of the contract that they belong to. Templates of any other are left to be enrolled
             again.
         batch
-            Templates in one transaction, and in memory.
+            Templates in one transaction, for which every other write waits.
         progress
             Called after each transaction with the number of templates that it moved.
         by
@@ -114,33 +104,23 @@ class Rerotation:
             At the end, if rows do not open or hold no template. All others are moved;
             :meth:`subjects_of_old_epochs` names the subjects to enroll again or erase.
         """
-        owner, database = self._tenants.get(tenant), self._context.database
+        database, total, broken, after = self._context.database, 0, 0, ""
         rotations = _Rotations(self._tenants, tenant, binding)
-        query = (
-            sa.select(*TEMPLATE_COLUMNS)
-            .join(TemplateRow, TemplateRow.subject_pk == SubjectRow.id)
-            .where(_is_older(owner), TemplateRow.contract_id == binding.contract_id)
-            .order_by(SubjectRow.id)
-            .limit(batch)
-        )
-        total = broken = 0
-        after = ""
-        while rows := self._after(query, SubjectRow.id, after):
-            after = rows[-1].subject_pk
-            rotated, failed = self._rotate_all(rotations, rows, owner.rotation_epoch)
-            changed = database.write(
-                lambda connection, rotated=rotated: sum(  # type: ignore[misc]
-                    self._replace(connection, template) for template in rotated
+        while True:
+            moved, failed, after = database.write(
+                lambda connection, after=after: self._move_batch(  # type: ignore[misc]
+                    connection, rotations, after, batch
                 )
             )
-            total, broken = total + changed, broken + failed
-            if progress is not None and changed:
-                progress(changed)
+            if not moved + failed:
+                break
+            total, broken = total + moved, broken + failed
+            if progress is not None and moved:
+                progress(moved)
+        epoch = self._tenants.get(tenant).rotation_epoch
         database.purge_log()
         if total:
-            database.write(
-                lambda connection: self._note(connection, "moved", tenant, owner.rotation_epoch, by)
-            )
+            database.write(lambda connection: self._note(connection, "moved", tenant, epoch, by))
         if broken:
             raise StoreError(
                 f"{broken} templates of tenant {tenant!r} could not be moved to its new "
@@ -165,7 +145,11 @@ class Rerotation:
             .order_by(SubjectRow.subject_id)
             .limit(batch)
         )
-        while rows := self._after(query, SubjectRow.subject_id, after):
+        while rows := self._context.database.read(
+            lambda connection, after=after: connection.execute(  # type: ignore[misc]
+                query.where(SubjectRow.subject_id > after)
+            ).all()
+        ):
             for (after,) in rows:
                 yield after
 
@@ -198,43 +182,40 @@ class Rerotation:
         self._context.database.purge_log()
         return dropped
 
-    def _after(self, query: Any, column: Any, after: str) -> Sequence[Any]:
-        return self._context.database.read(
-            lambda connection: connection.execute(query.where(column > after)).all()
-        )
-
     def _note(self, connection: Connection, outcome: str, tenant: str, epoch: int, by: By) -> None:
         entry = Entry(ACTION, outcome, by, tenant, detail=f"epoch {epoch}")
         self._context.audit_log.append(connection, entry)
 
-    def _rotate_all(
-        self, rotations: "_Rotations", rows: Sequence[Any], epoch: int
-    ) -> tuple[list[_Rotated], int]:
-        rotated, broken = [], 0
-        for row in rows:
+    def _move_batch(
+        self, connection: Connection, rotations: "_Rotations", after: str, batch: int
+    ) -> tuple[int, int, str]:
+        """Turn the templates after a row; returns how many, how many failed, and the last row."""
+        owner = tenant_of(connection, rotations.tenant)
+        query = (
+            sa.select(*TEMPLATE_COLUMNS)
+            .join(TemplateRow, TemplateRow.subject_pk == SubjectRow.id)
+            .where(_is_older(owner), TemplateRow.contract_id == rotations.binding.contract_id)
+            .where(SubjectRow.id > after)
+            .order_by(SubjectRow.id)
+            .limit(batch)
+        )
+        moved = broken = 0
+        for row in connection.execute(query).all():
+            after = row.subject_pk
             try:
-                stored = opened_template(row, self._context.keyring)
-                rotated.append(rotations.rotated(row, stored.wire, epoch))
+                wire = opened_template(row, self._context.keyring).wire
+                turned = rotations.turned(row, wire, owner.rotation_epoch)
             except (SealError, TemplateError, RetiredRotation):
                 broken += 1
-        return rotated, broken
+                continue
+            self._replace(connection, row, turned, owner.rotation_epoch)
+            moved += 1
+        return moved, broken, after
 
-    def _replace(self, connection: Connection, rotated: _Rotated) -> bool:
-        """Put the rotated template in the place of the one read, if that is still there."""
-        row = rotated.row
-        is_same = sa.and_(
-            TemplateRow.subject_pk == row.subject_pk,
-            TemplateRow.template_id == row.template_id,
-            TemplateRow.rotation_epoch == row.rotation_epoch,
-            # Once more begun meanwhile, the key of this epoch may be gone before the next move.
-            sa.exists().where(
-                TenantRow.id == row.tenant_id,
-                TenantRow.rotation_epoch == rotated.owner.rotation_epoch,
-            ),
+    def _replace(self, connection: Connection, row: Any, turned: bytes, epoch: int) -> None:
+        new = close_envelope(
+            turned, replace(owner_of(row), rotation_epoch=epoch), self._context.keyring
         )
-        if connection.execute(sa.select(TemplateRow.template_id).where(is_same)).first() is None:
-            return False
-        new = close_envelope(rotated.wire, rotated.owner, self._context.keyring)
         connection.execute(
             sa.update(SubjectRow)
             .where(SubjectRow.id == row.subject_pk)
@@ -243,36 +224,34 @@ class Rerotation:
         connection.execute(
             sa.update(TemplateRow)
             .where(TemplateRow.subject_pk == row.subject_pk)
-            .values(rotation_epoch=rotated.owner.rotation_epoch, ciphertext=new.ciphertext)
+            .values(rotation_epoch=epoch, ciphertext=new.ciphertext)
         )
-        return True
 
 
 class _Rotations:
     """The rotations of one tenant and contract, by epoch."""
 
     def __init__(self, tenants: Tenants, tenant: str, binding: Binding) -> None:
+        self.tenant = tenant
+        self.binding = binding
         self._tenants = tenants
-        self._tenant = tenant
-        self._binding = binding
         self._of_epochs: dict[int, TenantRotation] = {}
 
-    def rotated(self, row: Any, stored: bytes, epoch: int) -> _Rotated:
+    def turned(self, row: Any, stored: bytes, epoch: int) -> bytes:
         """Turn the wire bytes of a row's template as the contract's templates of an epoch are."""
-        binding, template = self._binding, wire.decode(stored)
+        binding, template = self.binding, wire.decode(stored)
         shape = template.subspace.n, template.subspace.m
         if template.contract_id != row.contract_id or shape != (binding.axes, binding.m):
             raise InvalidTemplate("a stored template is not of the contract that its row names")
         old = self._rotation(row.rotation_epoch).of(row.template_id)
         new = self._rotation(epoch).of(row.template_id)
         turned = template.subspace.turned_by(lambda points: new.turned(old.turned_back(points)))
-        data = wire.encode(turned, contract_id=binding.contract_id, dtype=template.dtype)
-        return _Rotated(row, replace(owner_of(row), rotation_epoch=epoch), data)
+        return wire.encode(turned, contract_id=binding.contract_id, dtype=template.dtype)
 
     def _rotation(self, epoch: int) -> TenantRotation:
         if epoch not in self._of_epochs:
-            key = self._tenants.rotation_key(self._tenant, epoch=epoch).key
-            self._of_epochs[epoch] = TenantRotation(key, self._binding.axes)
+            key = self._tenants.rotation_key(self.tenant, epoch=epoch).key
+            self._of_epochs[epoch] = TenantRotation(key, self.binding.axes)
         return self._of_epochs[epoch]
 
 

@@ -6,7 +6,6 @@ import subprocess
 import sys
 import threading
 import uuid
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any
@@ -28,7 +27,6 @@ from templates.space.subspace import SubspaceBatch
 from templates.store import Attempt, Source, TemplateStore, UnknownTenant
 from templates.store.audit_log import By
 from templates.store.database import Database
-from templates.store.rerotation import _Rotations
 from templates.store.schema import RotationKeyRow, SubjectRow, TemplateRow
 from templates.store.subject_rows import SubjectTemplate
 from templates.store.tenants import RetiredRotation
@@ -405,21 +403,21 @@ KILLED = """
 import os, signal, sys
 from templates.keys.sealing import MasterKeyring
 from templates.store import TemplateStore
-from templates.store.rerotation import Rerotation
+from templates.store import rerotation
 from tests.templates.store.test_rerotation import binding
 
 url, key_file, place = sys.argv[1:]
-replace = Rerotation._replace
+close = rerotation.close_envelope
 
 def die(*_: object) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 def die_inside(*arguments: object) -> None:
-    replace(*arguments)
+    close(*arguments)
     die()
 
 if place == "inside":
-    Rerotation._replace = die_inside
+    rerotation.close_envelope = die_inside
 store = TemplateStore(url, MasterKeyring.load(key_file))
 store.rerotation.move("default", binding(), batch=2, progress=die)
 """
@@ -444,62 +442,6 @@ def test_ten_kills_on_the_way_lose_nothing(
     assert store.rerotation.retire("default") == 1
     assert people.own_distances().max() < 1e-3
     assert store.audit_log.verify().intact
-
-
-def meanwhile(monkeypatch: pytest.MonkeyPatch, action: Callable[[], object]) -> None:
-    """Do something once, after a template was read and before it is replaced."""
-    rotated, done = _Rotations.rotated, threading.Event()
-
-    def rotated_late(*arguments: Any) -> Any:
-        template = rotated(*arguments)
-        if not done.is_set():
-            done.set()
-            action()
-        return template
-
-    monkeypatch.setattr(_Rotations, "rotated", rotated_late)
-
-
-def test_a_subject_that_is_enrolled_again_meanwhile_is_left_alone(
-    store: TemplateStore, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    people = People(store, 2)
-    people.enroll("s000")
-    people.enroll("s001")
-    store.rerotation.begin("default")
-    new = people.encoded(people.templates[1], "default", 2, "new")
-    meanwhile(monkeypatch, lambda: people.put("s000", new, 2, "default", "new"))
-    assert store.rerotation.move("default", binding()) == 1
-    stored = store.subjects.get("default", "s000")
-    assert stored is not None
-    assert stored.wire == new
-    assert store.rerotation.remaining("default") == 0
-
-
-def test_a_subject_that_is_erased_meanwhile_stays_erased(
-    store: TemplateStore, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    people = People(store, 2)
-    people.enroll("s000")
-    people.enroll("s001")
-    store.rerotation.begin("default")
-    meanwhile(monkeypatch, lambda: [store.erasures.erase("default", name) for name in people.names])
-    assert store.rerotation.move("default", binding()) == 0
-    assert rows(store) == {}
-
-
-def test_a_key_that_was_wrapped_again_meanwhile_is_not_put_back(
-    store: TemplateStore, key_file: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    people = People(store, 3)
-    for name in people.names:
-        people.enroll(name)
-    store.rerotation.begin("default")
-    MasterKeyring.add_current(key_file)
-    meanwhile(monkeypatch, store.wrapped_keys.rewrap)
-    assert store.rerotation.move("default", binding()) == 3
-    assert list(store.wrapped_keys.count()) == [MasterKeyring.load(key_file).current]
-    assert people.own_distances().max() < 1e-3
 
 
 def test_a_template_that_does_not_open_is_said_and_the_rest_is_moved(store: TemplateStore) -> None:
