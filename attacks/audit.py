@@ -1,52 +1,38 @@
 """The audit of templates: every attack on a template that we know, on people with photos."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from functools import cache
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from attacks.bed import AttackSetup, Effort, Testbed
 from attacks.errors import AuditError
 from attacks.further_faces import SAME_PHOTO, FurtherFaces, strangers_among
-from attacks.hill_climbing import climb_victims
-from attacks.holder_keys import (
-    Guess,
-    guess_from_few_decoys,
-    guess_with_and_without_holder_keys,
-)
-from attacks.learned import invert
-from attacks.learned.inverter import Inverter
-from attacks.linkage import link
-from attacks.outcomes import GENERATED, POOLED, AttackOutcome, Scheme
-from attacks.population import LEAST_FITTED, Population, draw_population, without_decoy_people
-from attacks.privacy import AttackSetup, Pairs
-from attacks.renewability import renew
-from attacks.several_templates import several_templates
-from attacks.stored import template_attacks
-from attacks.stored.foot_point import foot_points
-from attacks.stored.second_moments import (
-    ATTACK,
-    Guesser,
-    audit_setup,
-    second_moments_attack,
-)
-from attacks.system import System, enroll_victims, owners_pool
+from attacks.outcomes import AttackOutcome
+from attacks.population import Population, draw_population, without_decoy_people
+from attacks.runner import run_attack
+from attacks.stored import attacks_on_templates
 from models.extraction import Extraction
 from models.pack import ModelPack
 from templates.contract import wire
 from templates.contract.binding import embedding_id
-from templates.contract.document import Contract
+from templates.contract.document import Binding, Contract
 from templates.decoys import DecoyGenerator, DecoyPool, DecoySource
+from templates.distances import Metric
+from templates.errors import Uncalibrated
+from templates.keys.randomness import KEY_BYTES, Keystream
+from templates.keys.rotation import ROTATION_VERSION
 from templates.space.lifting import Strategy
+from verify import CalibrationOptions, calibrate
 from verify.evaluation.attributes import resembling
 from verify.own_decoys import require_others
 
-LINKED = 100
-"""Victims whose templates are linked across tenants: every two of them are compared."""
 DEFAULT_SHARE = 0.83
 """Of the decoys' variance, on the axes that are taken where nobody says how many."""
+LIFTED_PROBE_DIM = 8
+"""Dimension of the lifted probes that wolves are tried with, the best of docs/method.md §4.7."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +42,6 @@ class AuditPlan:
     The contract of a service says its own scheme; without one, each of ``strategy`` and ``dims`` is
     calibrated on people who are not attacked. ``axes``: of the generator's; None for those that
     hold 83 % of the variance. ``comparison`` adds templates with decoys of the ``owners``.
-    ``training_seconds`` is for the inverter; None trains none.
     """
 
     strategy: Strategy = Strategy.ADVERSARIAL
@@ -66,9 +51,16 @@ class AuditPlan:
     victims: int = 300
     owners: int = 600
     comparison: bool = True
-    climbed: int = 10
-    attempts: int = 1000
-    training_seconds: float | None = 120.0
+    effort: Effort = field(default_factory=Effort)
+    calibration: CalibrationOptions = field(
+        default_factory=lambda: CalibrationOptions(
+            probe_dims=(0, LIFTED_PROBE_DIM),
+            probe_photos=(1,),
+            metric=Metric.SPHERICAL,
+            lifted_probes=500,
+            lifted_impostor_pairs=60_000,
+        )
+    )
     seed: int = 0
 
 
@@ -113,12 +105,6 @@ def run_audit(
     population = draw_population(
         faces.descriptors, identities, victims=plan.victims, owners=plan.owners, seed=plan.seed
     )
-    if len(population.attacker) < 2 * LEAST_FITTED:
-        raise AuditError(
-            f"the attacker has {len(population.attacker)} faces, a third of the people who are "
-            f"neither victims nor decoy owners, and needs {2 * LEAST_FITTED}: ask for fewer "
-            "people (victims, owners), or give a larger folder"
-        )
     if decoys is None:
         fitted, population = without_decoy_people(population, seed=plan.seed)
         info = pack.info
@@ -129,84 +115,128 @@ def run_audit(
             _require_strangers(decoys, population)
         require_others(decoys, faces.descriptors, identities)
     beside = [
-        strangers_among(more, faces.descriptors, identities, population.victims.shown)
+        strangers_among(more, faces.descriptors, identities, population.victim_names)
         for more in further
     ]
-    kind = " and ".join(["the audited set", *(more.name for more in beside)])
-    schemes = _schemes(plan, decoys, population)
-    result = AuditResult(
-        [],
-        [],
-        [str(audited.scheme) for audited in schemes if audited.pool_of_owners],
-        {
-            **_settings(plan, population, decoys),
-            "further_attacker_faces": [more.to_json() for more in beside],
-        },
-    )
+    strategy, dims, axes = plan.strategy, plan.dims, plan.axes
+    if plan.contract is not None:
+        binding = plan.contract.binding
+        strategy, dims, axes = binding.strategy, (binding.m,), binding.axes
+    audited: list[tuple[DecoySource, int, bool]] = [(decoys, m, False) for m in dims]
+    if plan.comparison and strategy.needs_decoys and isinstance(decoys, DecoyGenerator):
+        pool = DecoyPool(population.owners.enrolled, made_with=decoys.made_with)
+        audited += [(pool, m, True) for m in dims]
+    result = AuditResult([], [], [], _settings(plan, population, decoys, beside))
+    attacks = list(attacks_on_templates())
     progress(0.0)
-    for number, audited in enumerate(schemes):
-        system = enroll_victims(
-            population,
-            audited.scheme,
-            audited.source,
-            embedder_sha256=pack.info.embedder_sha256,
-            preprocessing=pack.info.preprocessing,
-            contract=audited.contract,
-            seed=plan.seed,
-        )
-        result.schemes.append({**audited.scheme.to_json(), **_operating_point(system)})
-        known = _known(population, beside, with_owners=not audited.pool_of_owners)
-        victims = Pairs(population.victims.enrolled, population.victims.fresh)
-        setup = audit_setup(victims, *known, audited.source, seed=plan.seed)
-        attacks = _attacks(plan, system, setup, population, kind)
+    for number, (source, m, compared) in enumerate(audited):
+        bed = audit_bed(
+            population, source, strategy, axes=axes, m=m, beside=beside, compared=compared,
+            pack=pack, plan=plan,
+        )  # fmt: skip
+        result.schemes.append({**bed.scheme.to_json(), **_operating_point(bed)})
+        if compared:
+            result.comparisons.append(str(bed.scheme))
         for done, attack in enumerate(attacks, start=1):
-            result.outcomes.extend(attack())
-            progress((number + done / len(attacks)) / len(schemes))
+            result.outcomes.extend(run_attack(attack, bed))
+            progress((number + done / len(attacks)) / len(audited))
     return result
+
+
+def audit_bed(
+    population: Population,
+    source: DecoySource,
+    strategy: Strategy,
+    *,
+    axes: int | None,
+    m: int,
+    beside: Sequence[FurtherFaces] = (),
+    compared: bool = False,
+    pack: ModelPack,
+    plan: AuditPlan,
+) -> Testbed:
+    """Enroll the victims under a scheme, and calibrate where the plan has no contract of it.
+
+    Parameters
+    ----------
+    compared
+        The scheme's decoys are of the owners, so that these are none of the attacker's faces.
+
+    Raises
+    ------
+    AuditError
+        The contract is of another scheme.
+    Uncalibrated
+        The contract's default level has no target FMR.
+    """
+    if isinstance(source, DecoyGenerator):
+        source = source.reduced(axes or source.axes_for(DEFAULT_SHARE))
+    binding = Binding(
+        embedder_sha256=pack.info.embedder_sha256,
+        preprocessing=dict(pack.info.preprocessing),
+        n=source.n,
+        axes=source.k,
+        strategy=strategy,
+        m=m,
+        decoy_source_id=source.source_id,
+        rotation_version=ROTATION_VERSION,
+    )
+    contract = None if compared else plan.contract
+    if contract is None:
+        contract = _calibrated(population, binding, source, plan)
+    elif contract.binding != binding:
+        raise AuditError(
+            "the contract is of another scheme, model or decoy source than the audit's: give the "
+            "pack and the decoys that `calibrate` was given"
+        )
+    if contract.calibration("p2s").level(contract.default_level).target_fmr is None:
+        raise Uncalibrated(
+            f"an audit judges by a level with a target FMR, and {contract.default_level} has none"
+        )
+    faces, names = _known(population, beside, with_owners=not compared)
+    setup = AttackSetup.of(
+        population.victims,
+        faces,
+        source,
+        owners=np.unique(np.asarray(names, dtype=np.str_), return_inverse=True)[1],
+        seed=plan.seed,
+    )
+    bed = setup.bed(strategy, axes=source.k, m=m, contract=contract)
+    return replace(
+        bed, albums=population.albums, owners=population.owners.along(source), effort=plan.effort
+    )
+
+
+def _calibrated(
+    population: Population, binding: Binding, source: DecoySource, plan: AuditPlan
+) -> Contract:
+    """Calibrate as a service does, with a cohort of a seed: audits give the same figures twice."""
+    with Keystream.seeded("audit", plan.seed, binding.strategy, binding.m, "cohort") as stream:
+        cohort_seed = stream.token(KEY_BYTES)
+    dims = tuple(min(dim, binding.m) for dim in plan.calibration.probe_dims)
+    return calibrate(
+        population.others,
+        population.names,
+        binding=binding,
+        source=source,
+        options=replace(plan.calibration, probe_dims=dims, seed=plan.seed),
+        cohort_seed=cohort_seed,
+    ).contract
 
 
 def _known(
     population: Population, beside: Sequence[FurtherFaces], *, with_owners: bool
 ) -> tuple[NDArray[np.float32], list[str]]:
     """All photos of other people that a strong attacker has, and whose each is."""
-    rows, names = [population.known], [*population.known_names]
+    rows, names = [population.others], [*population.names]
     if with_owners:
         rows += [population.owners.enrolled, population.owners.fresh]
         names += 2 * [f"owner {number}" for number in range(len(population.owners))]
     for more in beside:
         rows.append(more.descriptors)
         names += more.people
-    return np.concatenate(rows), names
-
-
-@dataclass(frozen=True, eq=False)
-class _AuditedScheme:
-    """A scheme with its decoys; ``pool_of_owners`` where it is there to compare with."""
-
-    scheme: Scheme
-    source: DecoySource
-    pool_of_owners: bool
-    contract: Contract | None
-
-
-def _schemes(plan: AuditPlan, source: DecoySource, population: Population) -> list[_AuditedScheme]:
-    """The schemes to audit, and those to compare them with."""
-    strategy, dims, axes = plan.strategy, plan.dims, plan.axes
-    if plan.contract is not None:
-        binding = plan.contract.binding
-        strategy, dims, axes = binding.strategy, (binding.m,), binding.axes
-    if isinstance(source, DecoyGenerator):
-        source = source.reduced(axes or source.axes_for(DEFAULT_SHARE))
-    kind = POOLED if isinstance(source, DecoyPool) else GENERATED
-    decoys = kind if strategy.needs_decoys else None
-    on = source.k if source.k < source.n else None
-    schemes = [
-        _AuditedScheme(Scheme(strategy, decoys, m, on), source, False, plan.contract) for m in dims
-    ]
-    if plan.comparison and decoys == GENERATED:
-        pool = owners_pool(population, source.made_with)
-        schemes += [_AuditedScheme(Scheme(strategy, POOLED, m), pool, True, None) for m in dims]
-    return schemes
+    # A photo of a person without a name is taken for one of a person of its own.
+    return np.concatenate(rows), [name or f"\0{number}" for number, name in enumerate(names)]
 
 
 def _require_strangers(pool: DecoyPool, population: Population) -> None:
@@ -219,64 +249,28 @@ def _require_strangers(pool: DecoyPool, population: Population) -> None:
         )
 
 
-def _operating_point(system: System) -> dict[str, Any]:
+def _operating_point(bed: Testbed) -> dict[str, Any]:
     return {
-        "default_level": system.level.name,
-        "levels": [level.to_json() for level in system.points.levels],
-        "raw_thresholds": dict(system.raw_thresholds),
-        "template_bytes": wire.encoded_size(system.templates.n, system.templates.m),
+        "default_level": bed.level.name,
+        "levels": [level.to_json() for level in bed.points.levels],
+        "match_cosine": bed.match_cosine,
+        "template_bytes": wire.encoded_size(bed.source.k, bed.m),
     }
 
 
-def _settings(plan: AuditPlan, population: Population, decoys: DecoySource) -> dict[str, Any]:
+def _settings(
+    plan: AuditPlan, population: Population, decoys: DecoySource, beside: Sequence[FurtherFaces]
+) -> dict[str, Any]:
     return {
         "victims": plan.victims,
         "decoy_owners": plan.owners,
-        "attacker_faces": len(population.attacker),
+        "attacker_faces": len(population.others) + sum(len(more.descriptors) for more in beside),
         "calibration_people": len(set(population.names)),
         "calibration": "of the people" if plan.contract is None else "of the contract",
         "contract_id": None if plan.contract is None else plan.contract.contract_id,
         "decoy_source_id": decoys.source_id,
-        "attempts": plan.attempts,
-        "training_seconds": plan.training_seconds,
+        "attempts": plan.effort.attempts,
+        "training_seconds": plan.effort.training_seconds,
         "seed": plan.seed,
+        "further_attacker_faces": [more.to_json() for more in beside],
     }
-
-
-def _attacks(
-    plan: AuditPlan, system: System, setup: AttackSetup, population: Population, kind: str
-) -> list[Callable[[], list[AttackOutcome]]]:
-    """All attacks on a scheme, in the order of the report."""
-    inverters: dict[str, Inverter] = {}
-    guesser = cache(lambda: _informed(system, setup))
-    seconds = plan.training_seconds
-
-    def learned() -> list[AttackOutcome]:
-        if seconds is None:
-            return []
-        inverter, outcomes = invert(system, seconds=seconds, seed=plan.seed)
-        inverters["inverter"] = inverter
-        return outcomes
-
-    def holders() -> list[AttackOutcome]:
-        guesses: dict[str, Guess] = {"foot-point": foot_points, ATTACK: guesser()}
-        outcomes = guess_with_and_without_holder_keys(system, guesses | inverters)
-        return outcomes + guess_from_few_decoys(system)
-
-    return [
-        lambda: second_moments_attack(system, setup, kind=kind),
-        lambda: template_attacks(system),
-        learned,
-        holders,
-        lambda: several_templates(system, population.albums, guesser()),
-        lambda: link(system, liftings=2, most_people=LINKED),
-        lambda: renew(system, guesses={ATTACK: guesser()(system.templates)}),
-        lambda: climb_victims(
-            system.first(plan.climbed), most_attempts=plan.attempts, seed=plan.seed
-        ),
-    ]
-
-
-def _informed(system: System, setup: AttackSetup) -> Guesser:
-    """The guess of the attacker with all faces, of those that know no victim's moments."""
-    return Guesser(replace(system, attacker=system.source.project(setup.counted[-1][1])))

@@ -65,6 +65,11 @@ def score(
     return Scores(similarities, (similarities - means) / spreads)
 
 
+def fmr_of(level: Level) -> float:
+    """Return what a stranger reaches at a level: its FMR."""
+    return level.fmr.value if level.target_fmr is None else level.target_fmr
+
+
 def decide(
     probes: Probes,
     templates: SubspaceBatch,

@@ -7,7 +7,7 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from attacks.attributes.figure import attribute_figure
-from attacks.outcomes import Scheme
+from attacks.outcomes import Property, Scheme
 from verify.evaluation.figures.style import (
     DASHES,
     HUES,
@@ -23,7 +23,6 @@ from verify.evaluation.figures.style import (
 
 Row = Mapping[str, Any]
 NAMES = ("figure", "linkage", "oracle")
-LINKAGE = "linkage"
 ORACLE = "oracle"
 PANEL_INCHES = (4.8, 3.4)
 HEADER_INCHES = 1.3
@@ -58,12 +57,12 @@ def linkage_figure(outcomes: Sequence[Row]) -> Figure | None:
     One panel for each scheme (rows) and score (columns). At 1 a score means one person for sure,
     at 0 it tells nothing.
     """
-    rows = [row for row in outcomes if row["attack"] == LINKAGE]
+    rows = [row for row in outcomes if row["property"] == Property.UNLINKABILITY]
     if not rows:
         return None
     schemes = list(dict.fromkeys(Scheme.of(row) for row in rows))
-    scores = list(dict.fromkeys(_parts(row)[1] for row in rows))
-    settings = list(dict.fromkeys(_parts(row)[0] for row in rows))
+    scores = list(dict.fromkeys(row["attack"] for row in rows))
+    settings = list(dict.fromkeys(row["variant"] for row in rows))
     with house_style():
         figure, grid = panels(
             len(schemes),
@@ -73,7 +72,7 @@ def linkage_figure(outcomes: Sequence[Row]) -> Figure | None:
             header=HEADER_INCHES / 2,
         )
         for row in rows:
-            setting, score = _parts(row)
+            setting, score = row["variant"], row["attack"]
             axes = grid[schemes.index(Scheme.of(row))][scores.index(score)]
             number = settings.index(setting)
             edges, local = row["details"]["score_edges"], row["details"]["local_d"]
@@ -98,11 +97,6 @@ def linkage_figure(outcomes: Sequence[Row]) -> Figure | None:
         }
         _header_legend(figure, (list(labelled.values()), list(labelled)), len(labelled))
     return figure
-
-
-def _parts(row: Row) -> tuple[str, str]:
-    setting, _, score = str(row["variant"]).rpartition(", ")
-    return setting, score
 
 
 def oracle_figure(outcomes: Sequence[Row]) -> Figure | None:

@@ -1,6 +1,6 @@
 """Faces that an attacker brings beside those of the audited set, without the victims' own."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -44,7 +44,7 @@ def strangers_among(
     further: FurtherFaces,
     descriptors: NDArray[np.float32],
     identities: Sequence[str],
-    victims: NDArray[np.int64],
+    attacked: Collection[str],
 ) -> FurtherFaces:
     """Leave out the photos of victims, and those of people who are named like them.
 
@@ -52,8 +52,8 @@ def strangers_among(
     ----------
     descriptors, identities : (N, n) float32, N names
         The audited set.
-    victims
-        Rows of the set; all photos of the people on them are compared.
+    attacked
+        Names of the victims, all of whose photos are compared.
 
     Raises
     ------
@@ -66,7 +66,6 @@ def strangers_among(
             f"audited pack's have {descriptors.shape[1]}: embed it with the same pack"
         )
     names = np.asarray(identities, dtype=np.str_)
-    attacked = {str(names[row]) for row in victims}
     photos = descriptors[np.isin(names, list(attacked))]
     stranger = np.array([name not in attacked for name in further.people], dtype=np.bool_)
     for start in range(0, len(stranger), _TILE):

@@ -9,15 +9,10 @@ from typing import TypeAlias
 
 import numpy as np
 
-from attacks.privacy import (
-    LEAST_FACES,
-    LEAST_VICTIMS,
-    AttackSetup,
-    Pairs,
-    TestBed,
-    Theft,
-    all_thefts,
-)
+from attacks.bed import LEAST_FACES, LEAST_VICTIMS, AttackSetup, Pairs, Testbed
+from attacks.runner import Recovery, recoveries
+from attacks.stored.foot_point import foot_point
+from attacks.stored.second_moments import second_moments
 from templates.contract.binding import MAX_M
 from templates.contract.canonical import Json
 from templates.contract.document import Contract
@@ -152,10 +147,15 @@ def choose_and_judge(
         axes, m, chosen, tried = choose(
             choosing, strategy=strategy, axes=axes, m=m, progress=lambda one: progress(0.8 * one)
         )
-    thefts = all_thefts(judged, strategy, axes=axes, m=m)
+    thefts = thieves(judged.bed(strategy, axes=axes, m=m))
     progress(1.0)
     judgement = judge_privacy(thefts, axes=axes, m=m, uncovered=uncovered)
     return OperatingPoint(axes, m, chosen, tried, judgement)
+
+
+def thieves(bed: Testbed) -> list[Recovery]:
+    """What every attacker of the verdict gets: from the victims, and without limit, from drawn."""
+    return [*recoveries(foot_point, bed), *recoveries(second_moments, bed)]
 
 
 def choose(
@@ -220,18 +220,18 @@ def dims_to_try(axes: int) -> tuple[int, ...]:
 
 
 def judge_privacy(
-    thefts: Sequence[Theft], *, axes: int, m: int, uncovered: str | None = None
+    thefts: Sequence[Recovery], *, axes: int, m: int, uncovered: str | None = None
 ) -> Judgement:
     """Hold what the strongest attacker gets, and its upper bound, against the limits.
 
     Parameters
     ----------
     thefts
-        Of :func:`attacks.privacy.all_thefts`.
+        Of :func:`thieves`.
     uncovered
         What an attacker of such templates has and none of these had, in a sentence; None: nothing.
     """
-    strongest = max(thefts, key=_strength)
+    strongest = max(thefts, key=_strength).to_json()
     faces = max(theft.faces or 0 for theft in thefts)
     victims = min(theft.found.trials for theft in thefts if theft.faces is not None)
     shortfall = uncovered
@@ -240,15 +240,16 @@ def judge_privacy(
             f"{victims} people attacked with {faces} faces show little: calibrate on so many that "
             f"{LEAST_VICTIMS} are attacked with {LEAST_FACES:,} faces of the others"
         )
+    unlimited = isinstance(strongest["faces"], str)
     return Judgement(
-        strongest.found,
+        max(thefts, key=_strength).found,
         PRIVACY_LIMIT,
         {
             "axes": axes,
             "m": m,
-            "attack": strongest.attack,
-            "attacker_faces": "unlimited" if strongest.faces is None else strongest.faces,
-            "counted": strongest.counted,
+            "attack": strongest["attack"],
+            "attacker_faces": "unlimited" if unlimited else strongest["faces"],
+            "counted": strongest["counted"],
             "victims": victims,
             "attacks": [theft.to_json() for theft in thefts],
         },
@@ -257,7 +258,7 @@ def judge_privacy(
     )
 
 
-def _strength(theft: Theft) -> tuple[bool, float, float]:
+def _strength(theft: Recovery) -> tuple[bool, float, float]:
     """A share above the limit counts before a bound, and a bound before a share."""
     found = theft.found
     return found.value > PRIVACY_LIMIT, upper_bound(found.errors, found.trials), found.value
@@ -271,16 +272,19 @@ def _predicted(
     The logit of the share that the strongest attacker opens is taken for a line in m. Each point
     weighs by the inverse of its variance.
     """
-    bed = setup.along(axes, quick=True)
-    drawn = setup.simulated(bed)
-    beds = [one for one in (bed, drawn) if one is not None and len(one.victims)]
-    lines = [_line(one, strategy, dims) for one in beds]
+    bed = setup.bed(strategy, axes=axes, m=dims[0], quick=True)
+    by_dim = [thieves(bed), *(thieves(bed.at(m)) for m in dims[1:])]
+    lines = []
+    for drawn in (False, True):
+        found = [[one.found for one in made if (one.faces is None) == drawn] for made in by_dim]
+        if found[0]:
+            best = [max(rate.errors for rate in rates) for rates in found]
+            lines.append(_line(best, found[0][0].trials, dims))
     return lambda m: max(float(1 / (1 + np.exp(-line[0] - line[1] * m))) for line in lines)
 
 
-def _line(bed: TestBed, strategy: Strategy, dims: Sequence[int]) -> tuple[float, float]:
-    best = [max(one.found.errors for one in bed.thefts(strategy, m)) for m in dims]
-    shares = (np.array(best) + 0.5) / (len(bed.victims) + 1)
+def _line(best: Sequence[int], trials: int, dims: Sequence[int]) -> tuple[float, float]:
+    shares = (np.array(best) + 0.5) / (trials + 1)
     logits = np.log(shares / (1 - shares))
     if len(dims) == 1:
         return float(logits[0]), 0.0

@@ -1,7 +1,7 @@
 """What every attack reports: who was assumed to know what, and how often it succeeded."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from typing import Any, TypeAlias
 
@@ -41,8 +41,11 @@ class Leaked(StrEnum):
     key, the master key gives as much."""
 
 
-class Knowledge(StrEnum):
-    """What the attacker has beside what was stolen. Each but the last includes the one before."""
+class KnowledgeLevel(StrEnum):
+    """What the attacker has beside what was stolen: a column of the report.
+
+    Each but the last includes the one before.
+    """
 
     TEMPLATE = "template"
     """One template, and that descriptors are of unit length."""
@@ -54,6 +57,51 @@ class Knowledge(StrEnum):
     """A right whose answers tell what a template holds: scores, or thousands of decisions."""
     TEMPLATES = "templates"
     """The algorithm, and several templates: of the victim, or of a whole tenant."""
+
+
+@dataclass(frozen=True)
+class Knowledge:
+    """What an attack takes: one template, unless it says otherwise, and these.
+
+    Parameters
+    ----------
+    template
+        False where nothing needs to be stolen.
+    several
+        Several templates of one person.
+    unrotated
+        Nothing is gained from a template that is still in a secret rotation.
+    generator
+        How templates are lifted, the model and the decoy generator, which clients have.
+    faces
+        Photos of other people.
+    lifting
+        To lift faces as the service does, which of a pool takes the pool.
+    pool
+        The decoy pool.
+    scores
+        The right to see scores.
+    """
+
+    template: bool = True
+    several: bool = False
+    unrotated: bool = False
+    generator: bool = False
+    faces: bool = False
+    lifting: bool = False
+    pool: bool = False
+    scores: bool = False
+
+    def level(self, scheme: "Scheme") -> KnowledgeLevel:
+        """Return the column of the report, for templates of a scheme."""
+        if self.scores:
+            return KnowledgeLevel.RIGHT
+        if self.several:
+            return KnowledgeLevel.TEMPLATES
+        if self.pool or (self.lifting and scheme.decoys == POOLED):
+            return KnowledgeLevel.DECOYS
+        knows = self.generator or self.faces or self.lifting
+        return KnowledgeLevel.ALGORITHM if knows else KnowledgeLevel.TEMPLATE
 
 
 GENERATED, POOLED = "generator", "pool"
@@ -168,7 +216,7 @@ class AttackOutcome:
     variant: str = ""
     breaks: Property
     leaked: Leaked
-    knowledge: Knowledge
+    knowledge: KnowledgeLevel
     assumption: str
     scheme: Scheme
     level: str | None = None
@@ -217,38 +265,12 @@ class AttackOutcome:
         }
 
 
-def unproven(control: AttackOutcome, what: str, *, least: float | None = None) -> str | None:
+def unproven(control: AttackOutcome, what: str) -> str | None:
     """Return why rows are not judged whose control fails; None where it shows that they may be.
 
     What an attack does not get proves something only where the same attack gets it if it can. So a
     row is judged by its control, and never by its own result.
-
-    Parameters
-    ----------
-    least
-        Share that the control must reach; None: it must succeed as
-        :attr:`AttackOutcome.succeeds` says.
     """
-    shown = control.succeeds if least is None else control.measured.value >= least
-    return None if shown else f"it proves nothing, for its control, {what}, does not succeed either"
-
-
-def judged_by_controls(
-    rows: Sequence[AttackOutcome], hidden: str, shown: str
-) -> list[AttackOutcome]:
-    """Judge each row that lacks something by the same one that has it, as :func:`unproven` says.
-
-    Parameters
-    ----------
-    hidden, shown
-        What the names of the two differ in, such as a key that is kept, and stolen.
-    """
-    named = {row.name: row for row in rows}
-    return [
-        replace(
-            row, unjudged=row.unjudged or unproven(named[row.name.replace(hidden, shown)], shown)
-        )
-        if hidden in row.variant
-        else row
-        for row in rows
-    ]
+    if control.succeeds:
+        return None
+    return f"it proves nothing, for its control, {what}, does not succeed either"

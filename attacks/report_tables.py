@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from attacks.outcomes import Knowledge, Leaked, Property, Scheme
+from attacks.outcomes import KnowledgeLevel, Leaked, Property, Scheme
 from attacks.report import RESULTS
 from attacks.verdict import LIMITS, NOTHING_JUDGED
 from verify.evaluation.markdown_cells import (
@@ -19,11 +19,11 @@ from verify.evaluation.markdown_cells import (
 
 Row = Mapping[str, Any]
 _KNOWLEDGE = {
-    Knowledge.TEMPLATE: "template only",
-    Knowledge.ALGORITHM: "+ algorithm",
-    Knowledge.DECOYS: "+ decoys",
-    Knowledge.RIGHT: "+ right",
-    Knowledge.TEMPLATES: "k templates",
+    KnowledgeLevel.TEMPLATE: "template only",
+    KnowledgeLevel.ALGORITHM: "+ algorithm",
+    KnowledgeLevel.DECOYS: "+ decoys",
+    KnowledgeLevel.RIGHT: "+ right",
+    KnowledgeLevel.TEMPLATES: "k templates",
 }
 _LEAKED = {
     Leaked.DATABASE: "nothing, or the database only",
@@ -79,7 +79,7 @@ def _verdicts(report: Row) -> Iterable[str]:
                 *("<br>".join(cells[prop, known].get(leaked, [MISSING])) for leaked in Leaked),
             ]
             for prop in Property
-            for known in Knowledge
+            for known in KnowledgeLevel
             if (prop, known) in cells
         ]
         title = f"### {plain(str(Scheme.of(verdict)))}"

@@ -16,7 +16,7 @@ from attacks.outcomes import (
     COMPARED,
     CONTROL,
     AttackOutcome,
-    Knowledge,
+    KnowledgeLevel,
     Leaked,
     Property,
     Scheme,
@@ -166,7 +166,7 @@ class Cell:
             )
         if self.status is not Status.UNLIMITED or self.limit != WITH_KEY:
             return None
-        if self.outcome.knowledge is Knowledge.RIGHT:
+        if self.outcome.knowledge is KnowledgeLevel.RIGHT:
             return _BY_ANSWERS
         return _BY_DESIGN.get(self.outcome.breaks)
 
@@ -260,7 +260,7 @@ def judge(
         One a scheme, in the order of their first outcome.
     """
     most = {limit.name: limit.default for limit in LIMITS} | dict(limits or {})
-    by_scheme: dict[Scheme, dict[tuple[Property, Leaked, Knowledge, str], Cell]] = {}
+    by_scheme: dict[Scheme, dict[tuple[Property, Leaked, KnowledgeLevel, str], Cell]] = {}
     unjudged: dict[Scheme, list[AttackOutcome]] = {}
     for outcome in outcomes:
         if outcome.unjudged not in (CONTROL, COMPARED):
@@ -273,7 +273,7 @@ def judge(
         key = (outcome.breaks, outcome.leaked, outcome.knowledge, cell.limit)
         if key not in cells or cell.rank > cells[key].rank:
             cells[key] = cell
-    properties, thefts, knowledge = list(Property), list(Leaked), list(Knowledge)
+    properties, thefts, knowledge = list(Property), list(Leaked), list(KnowledgeLevel)
     return [
         Verdict(
             scheme,
@@ -313,9 +313,9 @@ def cell_of(outcome: AttackOutcome, most: Mapping[str, float]) -> Cell:
 
 
 def _limit_of(outcome: AttackOutcome) -> str:
-    several = outcome.knowledge is Knowledge.TEMPLATES
+    several = outcome.knowledge is KnowledgeLevel.TEMPLATES
     of_a_template = outcome.breaks in _OF_A_TEMPLATE and not several
-    if outcome.knowledge is Knowledge.RIGHT:
+    if outcome.knowledge is KnowledgeLevel.RIGHT:
         return WITH_KEY
     if outcome.leaked is Leaked.HOLDER_KEYS and not of_a_template:
         return WITH_KEY

@@ -24,9 +24,10 @@ from api.cli.options import (
 from api.service.opening import file_sealer, open_keyring
 from api.settings import Settings
 from attacks.audit import AuditPlan, run_audit
-from attacks.learned.extra import need
+from attacks.bed import Effort
 from attacks.population import LEAST_FITTED
 from attacks.report import document
+from attacks.stored.inverter import need
 from templates.contract.document import Binding, Contract
 from templates.decoys import DecoySource
 from templates.distances import on_device
@@ -209,9 +210,7 @@ def templates(
         victims=victims,
         owners=owners,
         comparison=comparison,
-        climbed=climbed,
-        attempts=attempts,
-        training_seconds=training_seconds if train else None,
+        effort=Effort(climbed, attempts, training_seconds if train else None),
         seed=seed,
     )
     labelled = labelled_folder(people)

@@ -26,7 +26,7 @@ from attacks.outcomes import (
     GENERATED,
     RAW_SCHEME,
     AttackOutcome,
-    Knowledge,
+    KnowledgeLevel,
     Leaked,
     Property,
     Scheme,
@@ -44,9 +44,9 @@ LIFTING_SHARE = 0.3
 
 ATTACK = "attribute-inference"
 _HAS = {
-    Knowledge.ALGORITHM: "One template, how templates are lifted, and labelled faces of other "
+    KnowledgeLevel.ALGORITHM: "One template, how templates are lifted, and labelled faces of other "
     "people, which it lifts itself to learn from",
-    Knowledge.DECOYS: "The same, and the pool that the decoys were drawn from",
+    KnowledgeLevel.DECOYS: "The same, and the pool that the decoys were drawn from",
 }
 
 

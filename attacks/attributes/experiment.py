@@ -19,7 +19,7 @@ from attacks.attributes.observations import (
 )
 from attacks.attributes.plan import Setup
 from attacks.attributes.rows import AttributeRow
-from attacks.outcomes import POOLED, Knowledge, Scheme
+from attacks.outcomes import POOLED, KnowledgeLevel, Scheme
 from templates.distances import Metric
 
 ByClass = Mapping[str, NDArray[np.float64]]
@@ -64,7 +64,9 @@ def run_scheme(setup: Setup, scheme: Scheme) -> list[AttributeRow]:
     )
     predictions: list[_Predictions] = [
         # The vote learns from no template, so that all of the attacker's own try it.
-        _Predictions(_KNN, metric, Knowledge.ALGORITHM, victims.votes[metric], own.votes[metric])
+        _Predictions(
+            _KNN, metric, KnowledgeLevel.ALGORITHM, victims.votes[metric], own.votes[metric]
+        )
         for metric in victims.votes
     ]
     truths = training.truth, validation.truth
@@ -72,11 +74,11 @@ def run_scheme(setup: Setup, scheme: Scheme) -> list[AttributeRow]:
     for name in setup.plan.attackers:
         attacked, held_out, seconds = _trained(setup, name, features, truths)
         choices = _chosen(attacked), _chosen(held_out)
-        predictions.append(_Predictions(name, None, Knowledge.ALGORITHM, *choices, seconds))
+        predictions.append(_Predictions(name, None, KnowledgeLevel.ALGORITHM, *choices, seconds))
     if not (victims.guessed is None or training.guessed is None or validation.guessed is None):
-        name, knowledge = _SECOND, Knowledge.ALGORITHM
+        name, knowledge = _SECOND, KnowledgeLevel.ALGORITHM
         if scheme.decoys == POOLED:
-            name, knowledge = _STRIP, Knowledge.DECOYS
+            name, knowledge = _STRIP, KnowledgeLevel.DECOYS
         features = training.guessed, validation.guessed, victims.guessed
         attacked, held_out, seconds = _trained(setup, "svm", features, truths)
         choices = _chosen(attacked), _chosen(held_out)
@@ -97,7 +99,7 @@ class _Predictions:
 
     attacker: str
     metric: Metric | None
-    knowledge: Knowledge
+    knowledge: KnowledgeLevel
     attacked: ByAttribute
     held: ByAttribute
     seconds: float = 0.0

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from attacks.outcomes import RAW, Knowledge
+from attacks.outcomes import RAW, KnowledgeLevel
 from templates.distances import Metric
 from verify.evaluation.figures.style import (
     GROUND,
@@ -37,8 +37,8 @@ _GAP = 0.9
 _LEAST_BARS = 3.4
 _HATCHES = ("/////", "", "xxxx", "\\\\\\\\\\", "....", "----")
 _MARKS = {
-    str(Knowledge.ALGORITHM): ("D", "strongest attacker, without the decoy pool"),
-    str(Knowledge.DECOYS): ("^", "strongest attacker, with the decoy pool"),
+    str(KnowledgeLevel.ALGORITHM): ("D", "strongest attacker, without the decoy pool"),
+    str(KnowledgeLevel.DECOYS): ("^", "strongest attacker, with the decoy pool"),
 }
 _UNIFORM = (0, (1.2, 1.4))
 _MAJORITY = (0, (6, 2))

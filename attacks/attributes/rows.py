@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from attacks.attributes.measures import InferenceMeasures
-from attacks.outcomes import Knowledge, Scheme
+from attacks.outcomes import KnowledgeLevel, Scheme
 from templates.contract.canonical import Json
 from templates.distances import Metric
 
@@ -39,7 +39,7 @@ class AttributeRow:
     attribute: str
     attacker: str
     metric: Metric | None
-    knowledge: Knowledge
+    knowledge: KnowledgeLevel
     classes: tuple[str, ...]
     measures: InferenceMeasures
     held_out: float
@@ -97,13 +97,13 @@ class AttributeRow:
 
 def strongest(
     rows: Iterable[AttributeRow],
-) -> dict[tuple[Scheme, str, Knowledge], AttributeRow]:
+) -> dict[tuple[Scheme, str, KnowledgeLevel], AttributeRow]:
     """Return the attacker to quote for each scheme, attribute and knowledge.
 
     It is the one that was strongest, above or below chance, on the attacker's own held-out faces.
     The best on the attacked faces themselves would be quoted with the luck of the best of several.
     """
-    best: dict[tuple[Scheme, str, Knowledge], AttributeRow] = {}
+    best: dict[tuple[Scheme, str, KnowledgeLevel], AttributeRow] = {}
     for row in rows:
         key = (row.scheme, row.attribute, row.knowledge)
         if key not in best or row.held_out > best[key].held_out:

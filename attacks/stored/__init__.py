@@ -1,23 +1,19 @@
-"""Attacks on stored templates: what a thief of templates learns, and which probes open them."""
+"""Attacks on stored templates and on the decision about probes: one file each.
 
-from attacks.outcomes import AttackOutcome
-from attacks.stored.foot_point import foot_point_attack
-from attacks.stored.known_database import known_database_attack
-from attacks.stored.nearest_neighbour import nearest_neighbour_attack
-from attacks.stored.oracle import oracle_attack
-from attacks.stored.presentation import presentation_attack
-from attacks.system import System
+Whatever a module here declares by :func:`attacks.runner.attack` is run by ``veilface audit
+templates``.
+"""
 
-SOME = 150
-"""Victims of the oracle, whose curve needs no more."""
+from collections.abc import Iterator
+from importlib import import_module
+from pkgutil import iter_modules
+
+from attacks.runner import Attack
 
 
-def template_attacks(system: System) -> list[AttackOutcome]:
-    """Run all attacks on stored templates, in order."""
-    return [
-        *foot_point_attack(system),
-        *known_database_attack(system),
-        *nearest_neighbour_attack(system),
-        *oracle_attack(system.first(SOME)),
-        *presentation_attack(system),
-    ]
+def attacks_on_templates() -> Iterator[Attack]:
+    """Yield the attacks that the modules of this package declare, by module name."""
+    for module in sorted(one.name for one in iter_modules(__path__)):
+        for declared in vars(import_module(f"{__name__}.{module}")).values():
+            if isinstance(declared, Attack) and declared.run.__module__ == f"{__name__}.{module}":
+                yield declared

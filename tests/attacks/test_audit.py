@@ -1,35 +1,18 @@
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
 
 import numpy as np
 import pytest
 
-from attacks import audit
-from attacks.audit import AuditPlan, run_audit
+from attacks.audit import run_audit
 from attacks.further_faces import FurtherFaces
 from attacks.outcomes import Scheme
+from attacks.stored import attacks_on_templates
 from models.extraction import Extraction
-from models.pack import ModelPack
 from templates.decoys import DecoyGenerator
 from templates.errors import ContractError
-from tests.attacks.stored.systems import OWNERS, VICTIMS, M, generator
-from tests.verify.synthetic import draw_people
+from tests.attacks.beds import OWNERS, PACK, PEOPLE, PLAN, M, bed_of, generator, population
 
-PEOPLE = draw_people(900, photos=(4, 2, 3), noise=0.35, seed=3)
 FACES = Extraction(PEOPLE.descriptors, [Path(str(i)) for i in range(len(PEOPLE.names))], [], 0)
-PACK = cast(
-    "ModelPack", SimpleNamespace(info=SimpleNamespace(embedder_sha256="ab" * 32, preprocessing={}))
-)
-PLAN = AuditPlan(
-    dims=(M,),
-    axes=60,
-    victims=VICTIMS,
-    owners=OWNERS,
-    climbed=2,
-    attempts=50,
-    training_seconds=None,
-)
 
 
 @pytest.mark.long
@@ -50,29 +33,21 @@ def test_an_audit_of_two_schemes_is_on_their_axes_and_reports_its_progress() -> 
     assert {row.scheme for row in result.outcomes} == {ours, compared}
     assert result.comparisons == [str(compared)]
     attacks = {row.attack for row in result.outcomes if row.scheme == ours}
-    assert attacks == {
-        "foot-point", "hill-climbing", "linkage", "nearest-neighbour", "oracle", "presentation",
-        "renewal-replay", "second-moments", "several-templates",
-    }  # fmt: skip
+    only_of_pools = {"known-pool", "pool-owner"}
+    assert attacks == {one.name for one in attacks_on_templates()} - only_of_pools - {"inverter"}
+    assert only_of_pools <= {row.attack for row in result.outcomes if row.scheme == compared}
     (more,) = result.settings["further_attacker_faces"]
     assert more["faces"] + more["left_out"] == 7
 
 
-def test_the_attacker_knows_everybody_but_the_victims(monkeypatch: pytest.MonkeyPatch) -> None:
-    given: list[Any] = []
-
-    def attacks(*arguments: Any) -> list[Any]:
-        given.append(arguments[2])
-        return [list]
-
-    monkeypatch.setattr(audit, "_attacks", attacks)
-    run_audit(PLAN, FACES, PEOPLE.names, pack=PACK, decoys=generator())
-    ours, pool = given
-    shown = np.isclose(PEOPLE.descriptors @ ours.victims.fresh.T, 1.0, atol=1e-5).any(axis=1)
-    victims = np.isin(PEOPLE.names, np.asarray(PEOPLE.names)[shown])
+def test_the_attacker_has_a_photo_of_everybody_but_the_victims() -> None:
+    ours, pool = bed_of(), bed_of("pool")
     # Of a pool's owners two photos each are known where they are no decoys.
-    assert len(ours.faces) == len(pool.faces) + 2 * OWNERS
-    assert not np.isclose(PEOPLE.descriptors[victims] @ ours.faces.T, 1.0, atol=1e-5).any()
+    assert len(ours.gallery) == len(pool.gallery) + OWNERS
+    victims = np.isin(PEOPLE.names, list(population().victim_names))
+    near = (ours.source.project(PEOPLE.descriptors) @ ours.gallery.T).max(axis=1) > 1 - 1e-5
+    assert not near[victims].any()
+    assert ours.attackers[1].faces == len(population().others) + 2 * OWNERS
 
 
 def test_decoys_of_the_judged_people_are_refused() -> None:

@@ -29,8 +29,9 @@ def linkage_rows() -> list[dict[str, Any]]:
                 rows.append(
                     {
                         **scheme,
-                        "attack": "linkage",
-                        "variant": f"{setting}, {score}",
+                        "attack": score,
+                        "property": "unlinkability",
+                        "variant": setting,
                         "details": {
                             "score_edges": [0.0, 0.25, 0.5, 1.0],
                             "local_d": [level, level + 0.1, level + 0.2],
@@ -45,6 +46,7 @@ def oracle_rows() -> list[dict[str, Any]]:
         {
             **scheme,
             "attack": "oracle",
+            "property": "irreversibility",
             "variant": variant,
             "details": {
                 "curve": [
@@ -75,7 +77,13 @@ ATTRIBUTES = [
     attribute_row("raw", None, 0, 0.9),
     attribute_row("adversarial", "generator", 16, 0.6),
 ]
-OTHER = {**SCHEMES[0], "attack": "foot-point", "variant": "", "details": {}}
+OTHER = {
+    **SCHEMES[0],
+    "attack": "foot-point",
+    "property": "irreversibility",
+    "variant": "",
+    "details": {},
+}
 
 
 def document(rows: list[dict[str, Any]], outcomes: list[dict[str, Any]]) -> dict[str, Any]:
@@ -93,7 +101,7 @@ def test_a_line_of_the_linkage_figure_is_the_local_d_of_its_row() -> None:
     assert [axes.get_xlabel() for axes in panels] == [f"score: {name}" for name in SCORES] * 2
     for place, axes in enumerate(panels):
         mine = [row for row in rows if row["dim"] == (16 if place < 2 else 4)]
-        mine = [row for row in mine if row["variant"].endswith(SCORES[place % 2])]
+        mine = [row for row in mine if row["attack"] == SCORES[place % 2]]
         drawn = [patch for patch in axes.patches if isinstance(patch, StepPatch)]
         assert [patch.get_label() for patch in drawn] == list(SETTINGS)
         for patch, row in zip(drawn, mine, strict=True):
@@ -108,7 +116,7 @@ def test_a_line_of_the_linkage_figure_is_the_local_d_of_its_row() -> None:
 
 def test_a_setting_of_one_score_is_in_the_legend() -> None:
     rows = linkage_rows()
-    alone = {**rows[-1], "variant": f"a control, {SCORES[-1]}"}
+    alone = {**rows[-1], "variant": "a control"}
     figure = linkage_figure([*rows, alone])
     assert figure is not None
     (legend,) = figure.legends

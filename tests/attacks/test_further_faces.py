@@ -14,7 +14,7 @@ def test_victims_are_left_out_by_name_and_by_photo() -> None:
     further = FurtherFaces(
         "more", np.stack([again, rows[4], rows[2], rows[5]]), ("", "ada", "bea", "")
     )
-    kept = strangers_among(further, rows[:4], names, np.array([1]))
+    kept = strangers_among(further, rows[:4], names, {"ada"})
     np.testing.assert_array_equal(kept.descriptors, np.stack([rows[2], rows[5]]))
     assert (kept.people, kept.left_out) == (("bea", ""), 2)
     assert kept.to_json() == {"name": "more", "faces": 2, "left_out": 2}
@@ -23,6 +23,4 @@ def test_victims_are_left_out_by_name_and_by_photo() -> None:
 def test_embeddings_of_another_pack_are_refused() -> None:
     rows = unit(np.random.default_rng(0).normal(size=(4, 40)))
     with pytest.raises(AuditError, match="same pack"):
-        strangers_among(
-            FurtherFaces("more", rows[:, :8], ("",) * 4), rows, ["a"] * 4, np.array([0])
-        )
+        strangers_among(FurtherFaces("more", rows[:, :8], ("",) * 4), rows, ["a"] * 4, {"a"})

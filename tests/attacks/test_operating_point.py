@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from attacks.bed import LEAST_VICTIMS, AttackSetup
 from attacks.operating_point import (
     AIM,
     MOST_BYTES,
@@ -16,11 +17,11 @@ from attacks.operating_point import (
     judge_groups,
     judge_privacy,
 )
-from attacks.privacy import LEAST_VICTIMS, AttackSetup, Theft
+from attacks.runner import Guesses, Recovery
 from templates.contract.levels import GroupRates, Level, Rate
 from templates.contract.verdict import Judgement
 from templates.space.lifting import Strategy
-from tests.attacks.test_privacy import FACES, OTHER, generator, rows
+from tests.attacks.kinds import FACES, OTHER, generator, rows
 from tests.templates.contract.test_contract import LIFTED, make_calibration, make_contract
 from tests.verify.synthetic import make_pool, unit
 
@@ -92,6 +93,13 @@ def test_dimensions_fit_the_axes_and_the_size_of_a_template() -> None:
     assert axes_to_try(make_pool()) == (64,)
 
 
+def theft(faces: int | None, found: Rate) -> Recovery:
+    """What an attacker of so many faces gets; None without limit."""
+    details = {"faces": "unlimited, simulated" if faces is None else faces}
+    guesses = Guesses(np.zeros((1, 1)), details=details)
+    return Recovery("second-moments", guesses, found, found, 0.5, 0.0)
+
+
 @pytest.mark.parametrize(
     ("people", "faces", "found", "uncovered", "status"),
     [
@@ -108,11 +116,7 @@ def test_a_verdict_passes_only_what_is_shown(
     people: int, faces: int, found: int, uncovered: str | None, status: str
 ) -> None:
     rate, none = Rate(found, people, 0.0, 1.0), Rate(0, people, 0.0, 1.0)
-    thefts = (
-        Theft("foot point", 0, "nothing", 1.0, none, none),
-        Theft("second moments", faces, "photos", 1.0, rate, none),
-        Theft("second moments", None, "exact moments", 1.0, Rate(0, 300, 0.0, 1.0), none),
-    )
+    thefts = (theft(0, none), theft(faces, rate), theft(None, Rate(0, 300, 0.0, 1.0)))
     judgement = judge_privacy(thefts, axes=224, m=96, uncovered=uncovered)
     assert judgement.status == status
     assert Judgement.from_json(judgement.to_json()) == judgement
@@ -120,10 +124,7 @@ def test_a_verdict_passes_only_what_is_shown(
 
 def test_who_knows_the_moments_exactly_may_be_the_strongest() -> None:
     few, many = Rate(0, 200, 0.0, 1.0), Rate(60, 300, 0.0, 1.0)
-    thefts = (
-        Theft("second moments", 5000, "photos", 1.0, few, few),
-        Theft("second moments", None, "exact moments", 1.0, many, few),
-    )
+    thefts = (theft(5000, few), theft(None, many))
     judgement = judge_privacy(thefts, axes=224, m=96)
     assert (judgement.status, judgement.basis["attacker_faces"]) == ("FAIL", "unlimited")
 

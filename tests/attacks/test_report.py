@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from attacks.outcomes import AttackOutcome, Estimate, Knowledge, Leaked, Property, Scheme
+from attacks.outcomes import AttackOutcome, Estimate, KnowledgeLevel, Leaked, Property, Scheme
 from attacks.report import document
 from attacks.report_tables import markdown
 from verify.metrics import rate
@@ -22,7 +22,7 @@ def outcomes(scheme: Scheme, hits: int) -> list[AttackOutcome]:
             attack="foot-point",
             breaks=Property.IRREVERSIBILITY,
             leaked=Leaked.HOLDER_KEYS,
-            knowledge=Knowledge.TEMPLATE,
+            knowledge=KnowledgeLevel.TEMPLATE,
             assumption="One template; guesses its foot point.",
             scheme=scheme,
             level="fmr-1e-3",
@@ -35,7 +35,7 @@ def outcomes(scheme: Scheme, hits: int) -> list[AttackOutcome]:
             variant="secret rotations, nearest points",
             breaks=Property.UNLINKABILITY,
             leaked=Leaked.MASTER_KEY,
-            knowledge=Knowledge.ALGORITHM,
+            knowledge=KnowledgeLevel.ALGORITHM,
             assumption="Two rotated templates | of two tenants.",
             scheme=scheme,
             measured=Estimate(0.09, 0.06, 0.12, 400, "bootstrap"),

@@ -8,7 +8,7 @@ from attacks.outcomes import (
     CONTROL,
     AttackOutcome,
     Estimate,
-    Knowledge,
+    KnowledgeLevel,
     Leaked,
     Measured,
     Property,
@@ -26,7 +26,7 @@ def outcome(
     measured: Measured,
     *,
     leaked: Leaked = Leaked.HOLDER_KEYS,
-    knowledge: Knowledge = Knowledge.ALGORITHM,
+    knowledge: KnowledgeLevel = KnowledgeLevel.ALGORITHM,
     chance: float = 0.001,
     attack: str = "some attack",
     unjudged: str | None = None,
@@ -91,9 +91,12 @@ def test_the_strongest_attack_fills_the_cell_and_unjudged_ones_do_not() -> None:
 
 def test_the_foot_point_has_a_limit_and_a_cell_of_its_own() -> None:
     foot = outcome(
-        Property.IRREVERSIBILITY, rate(20, 100), attack="foot-point", knowledge=Knowledge.TEMPLATE
+        Property.IRREVERSIBILITY,
+        rate(20, 100),
+        attack="foot-point",
+        knowledge=KnowledgeLevel.TEMPLATE,
     )
-    other = outcome(Property.IRREVERSIBILITY, rate(50, 100), knowledge=Knowledge.TEMPLATE)
+    other = outcome(Property.IRREVERSIBILITY, rate(50, 100), knowledge=KnowledgeLevel.TEMPLATE)
     (verdict,) = judge([foot, other], limits={"foot-point-success": 0.3})
     statuses = {cell.limit: cell.status for cell in verdict.cells}
     assert statuses == {"foot-point-success": Status.PASS, "recovery-success": Status.FAIL}
@@ -167,15 +170,15 @@ def test_a_doubt_is_not_hidden_behind_a_small_success() -> None:
 @pytest.mark.parametrize(
     ("breaks", "leaked", "knowledge"),
     [
-        (Property.IRREVERSIBILITY, Leaked.HOLDER_KEYS, Knowledge.TEMPLATES),
-        (Property.IRREVERSIBILITY, Leaked.DATABASE, Knowledge.RIGHT),
-        (Property.UNLINKABILITY, Leaked.HOLDER_KEYS, Knowledge.ALGORITHM),
-        (Property.RENEWABILITY, Leaked.HOLDER_KEYS, Knowledge.ALGORITHM),
-        (Property.IMPERSONATION, Leaked.HOLDER_KEYS, Knowledge.ALGORITHM),
+        (Property.IRREVERSIBILITY, Leaked.HOLDER_KEYS, KnowledgeLevel.TEMPLATES),
+        (Property.IRREVERSIBILITY, Leaked.DATABASE, KnowledgeLevel.RIGHT),
+        (Property.UNLINKABILITY, Leaked.HOLDER_KEYS, KnowledgeLevel.ALGORITHM),
+        (Property.RENEWABILITY, Leaked.HOLDER_KEYS, KnowledgeLevel.ALGORITHM),
+        (Property.IMPERSONATION, Leaked.HOLDER_KEYS, KnowledgeLevel.ALGORITHM),
     ],
 )
 def test_what_no_template_withstands_is_without_a_limit_and_says_why(
-    breaks: Property, leaked: Leaked, knowledge: Knowledge
+    breaks: Property, leaked: Leaked, knowledge: KnowledgeLevel
 ) -> None:
     broken = outcome(breaks, rate(100, 100), leaked=leaked, knowledge=knowledge)
     cell = only_cell(broken)
@@ -188,9 +191,11 @@ def test_what_no_template_withstands_is_without_a_limit_and_says_why(
     assert (limited.status, limited.reason) == (Status.FAIL, None)
 
 
-@pytest.mark.parametrize("knowledge", [Knowledge.ALGORITHM, Knowledge.TEMPLATES])
+@pytest.mark.parametrize("knowledge", [KnowledgeLevel.ALGORITHM, KnowledgeLevel.TEMPLATES])
 @pytest.mark.parametrize("breaks", [Property.IRREVERSIBILITY, Property.IMPERSONATION])
-def test_a_secret_rotation_leaves_next_to_nothing(breaks: Property, knowledge: Knowledge) -> None:
+def test_a_secret_rotation_leaves_next_to_nothing(
+    breaks: Property, knowledge: KnowledgeLevel
+) -> None:
     def cell(hits: int) -> Cell:
         stolen = Leaked.MASTER_KEY
         return only_cell(outcome(breaks, rate(hits, 1000), leaked=stolen, knowledge=knowledge))

@@ -9,7 +9,7 @@ import pytest
 import typer
 
 from api.cli.audit_report import conclude
-from attacks.outcomes import AttackOutcome, Knowledge, Leaked, Property, Scheme
+from attacks.outcomes import AttackOutcome, KnowledgeLevel, Leaked, Property, Scheme
 from attacks.report import document
 from models.pack import ModelPack
 from verify.metrics import rate
@@ -19,7 +19,7 @@ def row(**more: Any) -> AttackOutcome:
     return AttackOutcome(
         breaks=Property.IRREVERSIBILITY,
         leaked=Leaked.HOLDER_KEYS,
-        knowledge=Knowledge.ALGORITHM,
+        knowledge=KnowledgeLevel.ALGORITHM,
         assumption="Has what it has.",
         scheme=Scheme("adversarial", "generator", 16),
         chance=0.001,

@@ -13,19 +13,18 @@ import numpy as np
 import pytest
 
 import attacks.audit
-import attacks.population
-import attacks.system
 from api.cli import audit_templates
 from api.cli.options import DEFAULT_DIM
 from api.service.opening import file_sealer, open_keyring
 from api.settings import Settings
 from attacks.audit import AuditPlan, AuditResult
-from attacks.outcomes import Knowledge, Property
+from attacks.bed import Testbed
+from attacks.outcomes import KnowledgeLevel, Property
 from attacks.population import Population
-from attacks.stored import presentation
-from attacks.stored.foot_point import foot_point_attack
-from attacks.stored.known_database import known_database_attack
-from attacks.system import System
+from attacks.runner import run_attack
+from attacks.stored import wolves
+from attacks.stored.foot_point import foot_point
+from attacks.stored.known_pool import known_pool
 from attacks.verdict import LIMITS, Status
 from models.demo import DEMO_NOTICE
 from models.extraction import Extraction
@@ -33,7 +32,7 @@ from templates.decoys import DecoyGenerator, load_source
 from templates.space.lifting import Strategy
 from tests.api.cli.audit_bench import are_pictures, both, documented, draw_people, named_in
 from tests.api.cli.conftest import DIM, Ran, World, run
-from tests.attacks.stored.systems import system_of
+from tests.attacks.beds import bed_of
 from tests.leaks import LeakSearch
 from verify import calibrate
 
@@ -46,7 +45,7 @@ class TemplateAudit:
     asked: tuple[str | Path, ...]
     first: Ran
     populations: list[Population]
-    systems: list[System]
+    beds: list[Testbed]
     left: list[Path]
 
     @property
@@ -61,9 +60,9 @@ def on_small_material(patch: pytest.MonkeyPatch) -> None:
         few = replace(named["options"], lifted_probes=100, lifted_impostor_pairs=6_000, steps=10)
         return calibrate(*given, **{**named, "options": few})
 
-    patch.setattr(attacks.system, "calibrate", fewer)
-    patch.setattr(presentation, "TARGETS", 40)
-    patch.setattr(presentation, "STARTS", 2)
+    patch.setattr(attacks.audit, "calibrate", fewer)
+    patch.setattr(wolves, "TARGETS", 40)
+    patch.setattr(wolves, "STARTS", 2)
 
 
 @pytest.fixture(scope="module")
@@ -79,32 +78,29 @@ def people(world: World, tmp_path_factory: pytest.TempPathFactory) -> Iterator[T
         *("--climbed", "1", "--attempts", "50"),
     )
     populations: list[Population] = []
-    systems: list[System] = []
+    beds: list[Testbed] = []
     with pytest.MonkeyPatch.context() as patch:
         on_small_material(patch)
         patch.setattr(tempfile, "tempdir", str(root / "temporary"))
-        draw_population, enroll_victims = (
-            attacks.population.draw_population,
-            attacks.system.enroll_victims,
-        )
+        draw_population, audit_bed = attacks.audit.draw_population, attacks.audit.audit_bed
 
         def recorded_population(*given: Any, **named: Any) -> Population:
             populations.append(draw_population(*given, **named))
             return populations[-1]
 
-        def recorded_enrollment(*given: Any, **named: Any) -> System:
-            systems.append(enroll_victims(*given, **named))
-            return systems[-1]
+        def recorded_bed(*given: Any, **named: Any) -> Testbed:
+            beds.append(audit_bed(*given, **named))
+            return beds[-1]
 
         patch.setattr(attacks.audit, "draw_population", recorded_population)
-        patch.setattr(attacks.audit, "enroll_victims", recorded_enrollment)
+        patch.setattr(attacks.audit, "audit_bed", recorded_bed)
         first = run(
             *asked, "--no-comparison", "--max-success-with-key", "0",
             "--out", root / "out", "--json",
         )  # fmt: skip
         assert "error: " not in first.stderr, first.stderr
         left = list((root / "temporary").iterdir())
-        yield TemplateAudit(root, asked, first, populations[:], systems[:], left)
+        yield TemplateAudit(root, asked, first, populations[:], beds[:], left)
 
 
 @pytest.fixture(scope="module")
@@ -141,7 +137,7 @@ def is_as_documented(report: Any) -> None:
         assert outcome.keys() <= outcome_names | scheme
         assert outcome["measured"]["ci_low"] <= outcome["measured"]["value"]
         assert outcome["measured"]["value"] <= outcome["measured"]["ci_high"]
-    values = {*map(str, Property), *map(str, Knowledge), *map(str, Status)}
+    values = {*map(str, Property), *map(str, KnowledgeLevel), *map(str, Status)}
     cell_names = named_in("A cell of a verdict is") - values
     for verdict in report["verdicts"]:
         assert verdict.keys() == scheme | {"passed", "comparison", "cells", "not_judged"}
@@ -159,13 +155,13 @@ def test_what_two_attacks_found_becomes_report_verdict_and_status(
     world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The command around a small system with decoys of real people, which one attack opens."""
-    system = system_of("pool")
+    bed = bed_of("pool")
 
     def two_attacks(plan: AuditPlan, faces: Extraction, *_: Any, **__: Any) -> AuditResult:
         assert (plan.victims, len(faces.descriptors)) == (20, 20)
         # Those of the contract in data_dir, where nothing else is asked for.
         assert (plan.dims, plan.strategy) == ((DIM,), Strategy.ADVERSARIAL)
-        outcomes = [*foot_point_attack(system), *known_database_attack(system)]
+        outcomes = [*run_attack(foot_point, bed), *run_attack(known_pool, bed)]
         return AuditResult(outcomes, [], [], {"victims": plan.victims})
 
     monkeypatch.setattr(audit_templates, "run_audit", two_attacks)
@@ -234,7 +230,7 @@ def planned(
 
     def recorded(plan: AuditPlan, *_: Any, **__: Any) -> AuditResult:
         plans.append(plan)
-        return AuditResult(list(foot_point_attack(system_of("pool"))), [], [], {})
+        return AuditResult(run_attack(foot_point, bed_of("pool")), [], [], {})
 
     monkeypatch.setattr(audit_templates, "run_audit", recorded)
     ran = run(
@@ -306,7 +302,7 @@ def test_pools_are_compared_with_and_do_not_decide(compared: Ran, compared_repor
     audited, other = compared_report["verdicts"]
     assert (audited["decoys"], audited["comparison"]) == ("generator", False)
     assert (other["decoys"], other["comparison"]) == ("pool", True)
-    (known,) = [row for row in compared_report["outcomes"] if row["attack"] == "known-database"]
+    known, *_ = [row for row in compared_report["outcomes"] if row["attack"] == "known-pool"]
     assert known["decoys"] == "pool"
     assert known["measured"]["value"] > 0.9
     assert "For comparison: " in compared.stdout
@@ -336,18 +332,18 @@ def test_nothing_of_people_and_templates_stands_in_the_report(people: TemplateAu
                 population.owners.enrolled,
                 population.owners.fresh,
             ),
-            *(population.attacker, population.calibration),
+            population.others,
         ]
     )
     vectors = {f"face {i}": row for i, row in enumerate(rows)}
-    for system in people.systems:
-        for number, template in enumerate(system.templates.bases):
-            vectors[f"{system.scheme}, basis {number}"] = template
-            vectors[f"{system.scheme}, foot {number}"] = system.templates.feet[number]
+    for bed in people.beds:
+        for number, template in enumerate(bed.templates.bases):
+            vectors[f"{bed.scheme}, basis {number}"] = template
+            vectors[f"{bed.scheme}, foot {number}"] = bed.templates.feet[number]
     search = LeakSearch(vectors=vectors)
     written = b"\n".join(file.read_bytes() for file in sorted(people.out.iterdir()))
     said = (people.first.stdout + people.first.stderr).encode()
     assert search.find(written + said) == []
-    assert search.find(said + people.systems[0].templates.feet[3].tobytes()) != []
+    assert search.find(said + people.beds[0].templates.feet[3].tobytes()) != []
     assert b"drawn-0" not in written + said
     assert b"person-6" not in written + said

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from attacks.several_templates import nearest_common_points
+from attacks.stored.several_templates import nearest_common_points
 from models.pack import ModelPack
 from models.photos import embed_photos
 from templates.contract import wire

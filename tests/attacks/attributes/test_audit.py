@@ -14,7 +14,7 @@ from attacks.attributes.measures import Leakage, measure
 from attacks.attributes.plan import AttributePlan
 from attacks.attributes.rows import AttributeRow
 from attacks.errors import AuditError
-from attacks.outcomes import RAW_SCHEME, AttackOutcome, Knowledge, Property, Scheme
+from attacks.outcomes import RAW_SCHEME, AttackOutcome, KnowledgeLevel, Property, Scheme
 from attacks.verdict import judge
 from templates.errors import DecoyError, LiftingError
 from tests.attacks.attributes.people import faces
@@ -48,7 +48,7 @@ def row(
     right: int,
     *,
     held_out: float,
-    knowledge: Knowledge = Knowledge.ALGORITHM,
+    knowledge: KnowledgeLevel = KnowledgeLevel.ALGORITHM,
     attribute: str = "gender",
 ) -> AttributeRow:
     """``right`` of 200 faces, half of each class, are told; the others are mistaken."""
@@ -103,15 +103,17 @@ def test_who_holds_the_pool_is_quoted_apart_and_says_so() -> None:
         [
             raw(),
             row(POOL, "knn", 100, held_out=0.0),
-            row(POOL, "strip", 180, held_out=0.4, knowledge=Knowledge.DECOYS),
+            row(POOL, "strip", 180, held_out=0.4, knowledge=KnowledgeLevel.DECOYS),
         ],
         audited=SERVICE,
     )
     by_knowledge = {one.knowledge: one for one in outcomes if one.scheme == POOL}
-    assert by_knowledge[Knowledge.ALGORITHM].measured.value == 0.5
-    assert by_knowledge[Knowledge.DECOYS].measured.value == 0.9
-    assert "the pool that the decoys were drawn from" in by_knowledge[Knowledge.DECOYS].assumption
-    assert "pool" not in by_knowledge[Knowledge.ALGORITHM].assumption
+    assert by_knowledge[KnowledgeLevel.ALGORITHM].measured.value == 0.5
+    assert by_knowledge[KnowledgeLevel.DECOYS].measured.value == 0.9
+    assert (
+        "the pool that the decoys were drawn from" in by_knowledge[KnowledgeLevel.DECOYS].assumption
+    )
+    assert "pool" not in by_knowledge[KnowledgeLevel.ALGORITHM].assumption
 
 
 def test_only_the_audited_scheme_is_judged() -> None:

@@ -13,7 +13,7 @@ from attacks.attributes.measures import Leakage
 from attacks.attributes.plan import AttributePlan, Setup, prepare, schemes_of
 from attacks.attributes.rows import AttributeRow, strongest
 from attacks.errors import AuditError
-from attacks.outcomes import GENERATED, POOLED, RAW_SCHEME, Knowledge, Scheme
+from attacks.outcomes import GENERATED, POOLED, RAW_SCHEME, KnowledgeLevel, Scheme
 from templates.decoys import DecoyGenerator
 from templates.distances import on_device
 from tests.attacks.attributes.people import faces
@@ -92,7 +92,7 @@ def test_who_holds_the_pool_sees_through_adversarial_lifting() -> None:
     for attribute in ("gender", "race"):
         assert found["strip", attribute].accuracy > raw["svm", attribute].accuracy - 0.05
         assert found["strip", attribute].accuracy > found["svm", attribute].accuracy + 0.1
-    assert found["strip", "gender"].knowledge is Knowledge.DECOYS
+    assert found["strip", "gender"].knowledge is KnowledgeLevel.DECOYS
 
 
 def test_the_rule_of_hybrid_plus_gives_it_away() -> None:
@@ -135,7 +135,7 @@ def test_decoys_that_are_spread_unlike_faces_point_at_the_descriptor(
         assert np.mean(margins) > more
         for run in runs:
             assert run["second moments", attribute].measures.leakage is Leakage.ABOVE
-            assert run["second moments", attribute].knowledge is Knowledge.ALGORITHM
+            assert run["second moments", attribute].knowledge is KnowledgeLevel.ALGORITHM
 
 
 def attacked_with_flat_decoys(scheme: Scheme, draw: int) -> Found:
@@ -150,7 +150,7 @@ def attacked_with_flat_decoys(scheme: Scheme, draw: int) -> Found:
 
 def test_only_pools_have_attackers_who_hold_them() -> None:
     for scheme, wanted in ((OURS, False), (RANDOM, False), (ADVERSARIAL, True)):
-        assert any(row.knowledge is Knowledge.DECOYS for row in attacked(scheme)) is wanted
+        assert any(row.knowledge is KnowledgeLevel.DECOYS for row in attacked(scheme)) is wanted
     assert not any(row.attacker == "rule" for row in attacked(ADVERSARIAL))
 
 
@@ -260,12 +260,12 @@ def test_the_best_attacker_is_chosen_before_the_victims() -> None:
     assert set(chosen) == {
         (PLUS, attribute, known)
         for attribute in ("gender", "race")
-        for known in (Knowledge.ALGORITHM, Knowledge.DECOYS)
+        for known in (KnowledgeLevel.ALGORITHM, KnowledgeLevel.DECOYS)
     }
     for (_, attribute, known), best in chosen.items():
         among = [r for r in rows if r.attribute == attribute and r.knowledge == known]
         assert best.held_out == max(row.held_out for row in among)
-    assert chosen[PLUS, "gender", Knowledge.DECOYS].attacker == "rule"
+    assert chosen[PLUS, "gender", KnowledgeLevel.DECOYS].attacker == "rule"
 
 
 def test_the_default_grid_is_the_papers_and_ours() -> None:

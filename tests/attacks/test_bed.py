@@ -1,37 +1,16 @@
-import functools
-
 import numpy as np
 import pytest
 
+from attacks.bed import MEANS, ONE_PHOTO, PHOTOS, AttackSetup, Pairs, face_counts
 from attacks.errors import AuditError
-from attacks.privacy import (
-    MEANS,
-    ONE_PHOTO,
-    PHOTOS,
-    SPHERE_SHARES,
-    AttackSetup,
-    Pairs,
-    Theft,
-    all_thefts,
-    face_counts,
-)
-from templates.decoys import DecoyGenerator
+from attacks.operating_point import thieves
+from attacks.population import ENROLLED_PHOTOS, draw_population
+from attacks.runner import Recovery
+from attacks.stored.second_moments import SPHERE_SHARES
 from templates.errors import DecoyError
 from templates.space.lifting import Strategy
+from tests.attacks.kinds import FACES, OTHER, N, generator, rows
 from tests.verify.synthetic import make_pool, unit
-
-N = 48
-FACES = np.linspace(1.0, 0.3, N)
-OTHER = np.roll(FACES, N // 2)
-
-
-def rows(count: int, deviations: np.ndarray, seed: int) -> np.ndarray:
-    return unit(np.random.default_rng(seed).normal(size=(count, N)) * deviations).astype(np.float32)
-
-
-@functools.cache
-def generator(kind: tuple[float, ...]) -> DecoyGenerator:
-    return DecoyGenerator.fit(rows(3_000, np.array(kind), 4))
 
 
 def setup_with(kind: np.ndarray, *, shuffled: bool = False) -> AttackSetup:
@@ -42,38 +21,41 @@ def setup_with(kind: np.ndarray, *, shuffled: bool = False) -> AttackSetup:
     return AttackSetup.of(victims, rows(1_500, FACES, 3), generator(tuple(kind)))
 
 
-def best(thefts: tuple[Theft, ...]) -> Theft:
-    return max(thefts, key=lambda theft: theft.found.value)
+def best(thefts: list[Recovery], *, drawn: bool = False) -> Recovery:
+    return max(
+        (one for one in thefts if (one.faces is None) == drawn), key=lambda one: one.found.value
+    )
 
 
 @pytest.mark.parametrize("axes", [N, 40])
-def test_decoys_of_another_kind_and_random_lifting_fail(axes: int) -> None:
-    bed = setup_with(OTHER).along(axes)
+@pytest.mark.parametrize("strategy", [Strategy.ADVERSARIAL, Strategy.HYBRID, Strategy.RANDOM])
+def test_decoys_of_another_kind_and_random_lifting_fail(axes: int, strategy: Strategy) -> None:
+    bed = setup_with(OTHER).bed(strategy, axes=axes, m=8)
     assert bed.victims.enrolled.shape == (120, axes)
-    for strategy in (Strategy.ADVERSARIAL, Strategy.HYBRID, Strategy.RANDOM):
-        strongest = best(bed.thefts(strategy, 8))
-        assert strongest.found.value > 0.7, strategy
-        assert strongest.found.trials == 120
+    strongest = best(thieves(bed))
+    assert strongest.found.value > 0.7
+    assert strongest.found.trials == 120
 
 
 def test_more_decoys_of_the_same_kind_hide_more() -> None:
-    bed = setup_with(FACES).along(N)
-    few, many = (best(bed.thefts(Strategy.ADVERSARIAL, m)).found for m in (2, 20))
+    bed = setup_with(FACES).bed(Strategy.ADVERSARIAL, axes=N, m=2)
+    few, many = (best(thieves(one)).found for one in (bed, bed.at(20)))
     assert many.value < few.value - 0.3
 
 
 def test_photos_of_other_people_are_matched_by_chance() -> None:
-    thefts = setup_with(OTHER, shuffled=True).along(N).thefts(Strategy.ADVERSARIAL, 8)
+    thefts = thieves(setup_with(OTHER, shuffled=True).bed(Strategy.ADVERSARIAL, axes=N, m=8))
     assert best(thefts).found.value < 0.05
     assert max(theft.control.value for theft in thefts) < 0.05
 
 
 def test_attackers_are_named_by_their_faces_and_how_they_count_them() -> None:
-    thefts = setup_with(FACES).along(N).thefts(Strategy.HYBRID, 4)
-    named = [(theft.attack, theft.faces, theft.share) for theft in thefts]
+    thefts = thieves(setup_with(FACES).bed(Strategy.HYBRID, axes=N, m=4))
+    named = [(one.attack, one.faces, one.to_json()["share_of_decoys"]) for one in thefts]
     assert named == [
-        ("foot point", 0, 1.0),
-        *(("second moments", faces, share) for share in SPHERE_SHARES for faces in (1_000, 1_500)),
+        ("foot-point", 0, 1.0),
+        *(("second-moments", faces, share) for share in SPHERE_SHARES for faces in (1_000, 1_500)),
+        *(("second-moments", None, share) for share in SPHERE_SHARES),
     ]
     assert face_counts(900) == (900,)
     assert face_counts(9_000) == (1_000, 5_000, 9_000)
@@ -95,17 +77,15 @@ def test_an_attacker_without_limit_finds_more_where_decoys_fit_worse() -> None:
     found = []
     for kind in (FACES, OTHER):
         setup = setup_with(kind)
-        drawn = setup.simulated(setup.along(N))
-        assert drawn is not None
-        seen = np.einsum("ij,ij->i", drawn.victims.enrolled, drawn.victims.fresh)
+        bed = setup.bed(Strategy.ADVERSARIAL, axes=N, m=12)
+        assert bed.drawn is not None
+        drawn = bed.drawn.victims
+        seen = np.einsum("ij,ij->i", drawn.enrolled, drawn.fresh)
         real = np.einsum("ij,ij->i", setup.victims.enrolled, setup.victims.fresh)
         assert np.isclose(np.sort(real)[:, None], seen, atol=1e-5).any(axis=0).all()
-        found.append(drawn.thefts(Strategy.ADVERSARIAL, 12)[1])
+        found.append(best(thieves(bed), drawn=True))
     assert found[1].found.value > found[0].found.value + 0.2
     assert found[0].to_json()["faces"] == "unlimited, simulated"
-    assert [theft.faces for theft in all_thefts(setup, Strategy.ADVERSARIAL, axes=N, m=12)] == [
-        0, 1_000, 1_500, None,
-    ]  # fmt: skip
 
 
 def test_of_people_splits_them_without_overlap() -> None:
@@ -152,3 +132,53 @@ def test_what_does_not_fit_is_refused() -> None:
         )
     with pytest.raises(DecoyError, match="have all 64 numbers"):
         make_pool().reduced(60)
+
+
+def photos_of(
+    people: int, *, several: int, photos: int = 4, n: int = 16
+) -> tuple[np.ndarray, list[str]]:
+    """Photos of which every number is the person's and the photo's, to be told apart."""
+    rng = np.random.default_rng(0)
+    names = [f"p{i}" for i in range(people) for _ in range(photos if i < several else 1)]
+    return unit(rng.standard_normal((len(names), n))), names
+
+
+def owner_of(photos: np.ndarray, names: list[str], wanted: np.ndarray) -> list[str]:
+    return [names[int(np.argmax(photos @ row))] for row in wanted]
+
+
+def test_nobody_plays_two_parts_and_the_fresh_photo_is_not_enrolled() -> None:
+    photos, names = photos_of(700, several=200)
+    population = draw_population(photos, names, victims=60, owners=100, seed=3)
+    victims = owner_of(photos, names, population.victims.fresh)
+    owners = owner_of(photos, names, population.owners.fresh)
+    parts = [set(victims), set(owners), set(population.names)]
+    assert [len(part) for part in parts] == [60, 100, 540]
+    assert len(set.union(*parts)) == 700
+    assert parts[0] == population.victim_names
+    assert owner_of(photos, names, population.others) == list(population.names)
+    for row, person in enumerate(victims):
+        album = photos[[name == person for name in names]]
+        fresh = int(np.argmax(album @ population.victims.fresh[row]))
+        enrolled = np.delete(album, fresh, axis=0)
+        assert len(enrolled) == ENROLLED_PHOTOS
+        mean = unit(enrolled.mean(axis=0))
+        assert population.victims.enrolled[row] @ mean == pytest.approx(1, abs=1e-6)
+    assert owner_of(photos, names, population.owners.enrolled) == owners
+    seen = np.einsum("ij,ij->i", population.owners.enrolled, population.owners.fresh)
+    assert seen.max() < 0.999
+    again, other = (
+        draw_population(photos, names, victims=60, owners=100, seed=seed) for seed in (3, 4)
+    )
+    np.testing.assert_array_equal(population.victims.enrolled, again.victims.enrolled)
+    assert not np.array_equal(population.victims.enrolled, other.victims.enrolled)
+
+
+@pytest.mark.parametrize(
+    ("victims", "owners", "said"),
+    [(100, 101, "people with two"), (190, 10, "left to calibrate")],
+)
+def test_too_few_people_are_refused(victims: int, owners: int, said: str) -> None:
+    photos, names = photos_of(300, several=200, photos=2)
+    with pytest.raises(AuditError, match=said):
+        draw_population(photos, names, victims=victims, owners=owners, seed=0)

@@ -5,21 +5,20 @@ how templates are lifted, lifts faces of its own, and sees how the scores of two
 over templates. No other template than the one that is asked about is used.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from attacks.decisions import score
+from attacks.bed import Testbed
+from attacks.decisions import fmr_of, score
 from attacks.errors import AuditError
-from attacks.outcomes import AttackOutcome, Knowledge, Leaked, Property
-from attacks.recovery import fmr_of
-from attacks.system import System
+from attacks.outcomes import Knowledge, Property
+from attacks.runner import Hits, attack
 from templates.distances import Metric, pairwise_distances, similarity
 from templates.space.embedding import normalised
 from templates.space.subspace import SubspaceBatch
-from verify.metrics import rate
 
 LOCKOUTS = (5, 50)
 """Consecutive failures after which a service delays, and locks (NIST SP 800-63B)."""
@@ -122,62 +121,41 @@ def climb(ask: Ask, prior: Prior, start: NDArray[np.floating], *, most: int, see
     return np.inf
 
 
-def climb_victims(system: System, *, most_attempts: int, seed: int) -> list[AttackOutcome]:
-    """Climb towards every victim's template; report success within lockouts, and in all attempts.
+@attack(breaks=Property.IMPERSONATION, needs=Knowledge(template=False, lifting=True, scores=True))
+def hill_climbing(bed: Testbed) -> Iterator[Hits]:
+    """Probes are sent and climb by the scores that come back, until one is accepted.
 
-    Raises
-    ------
-    AuditError
-        The attacker has fewer than four faces.
+    Success within lockouts, and in all attempts.
     """
-    count = min(OWN_TEMPLATES, len(system.attacker) // 2)
+    bed = bed.first(bed.effort.climbed)
+    most = bed.effort.attempts
+    count = min(OWN_TEMPLATES, len(bed.gallery) // 2)
     if count < 2:
         raise AuditError("a climber learns on faces of four people or more")
-    own = system.lift(system.attacker[-count:], "rehearsal of a climb")
-    prior = learn_prior(system.attacker[:-count], own)
+    own = bed.lift(bed.gallery[-count:], "rehearsal of a climb")
+    prior = learn_prior(bed.gallery[:-count], own)
     reached = np.array(
         [
-            climb(
-                _answers(system, victim),
-                prior,
-                system.attacker[0],
-                most=most_attempts,
-                seed=seed + victim,
-            )
-            for victim in range(len(system.templates))
+            climb(answers(bed, victim), prior, bed.gallery[0], most=most, seed=bed.seed + victim)
+            for victim in range(len(bed.templates))
         ]
     )
-    fmr = fmr_of(system.level)
     median = float(np.median(reached))
-    limits = {*(limit for limit in LOCKOUTS if limit <= most_attempts), most_attempts}
-    return [
-        AttackOutcome(
-            attack="hill-climbing",
-            variant=f"scores, {limit} attempts",
-            breaks=Property.IMPERSONATION,
-            leaked=Leaked.DATABASE,
-            knowledge=Knowledge.RIGHT,
-            assumption="How templates are lifted, faces of other people, and the rights to send "
-            f"embeddings and to see scores; success is acceptance within {limit} attempts, none of "
-            "which was accepted before",
-            scheme=system.scheme,
-            level=system.level.name,
-            measured=rate(int(np.count_nonzero(reached <= limit)), len(reached)),
-            chance=1 - (1 - fmr) ** limit,
-            details={
-                "limit": limit,
-                "median_attempts": median if np.isfinite(median) else None,
-            },
+    for limit in sorted({*(lockout for lockout in LOCKOUTS if lockout <= most), most}):
+        yield Hits(
+            reached <= limit,
+            f"{limit} attempts",
+            chance=1 - (1 - fmr_of(bed.level)) ** limit,
+            details={"limit": limit, "median_attempts": median if np.isfinite(median) else None},
         )
-        for limit in sorted(limits)
-    ]
 
 
-def _answers(system: System, victim: int) -> Ask:
-    template = system.templates[np.array([victim])]
+def answers(bed: Testbed, victim: int) -> Ask:
+    """Return what the service says of a probe: its decision, and the similarity."""
+    template = bed.templates[np.array([victim])]
 
     def ask(probe: NDArray[np.float32]) -> tuple[bool, float]:
-        scores = score(probe[None], template, system.nobody, system.points)
-        return bool(scores.at(system.level)[0, 0]), float(scores.similarities[0, 0])
+        scores = score(probe[None], template, bed.nobody, bed.points)
+        return bool(scores.at(bed.level)[0, 0]), float(scores.similarities[0, 0])
 
     return ask

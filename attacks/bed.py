@@ -1,37 +1,35 @@
-"""How many templates the strongest attacker opens who knows second moments: one figure for a pair.
+"""The bed that every attack acts on: people, their templates, and what an attacker has.
 
-``veilface calibrate`` chooses the axes and the dimension by it and judges them by it, and an audit
-reports the same attack. The attackers differ in the faces that they have, 1,000, 5,000, and all
-that there are, and in how they count them: every photo, one photo of each person, or the mean of a
-person's photos, as people are enrolled. One without limit is simulated, because nobody has faces
-without limit. The verdict is that of the best.
+``veilface calibrate`` and ``veilface audit templates`` make it alike, so that they judge the same
+attackers by the same limits.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from attacks.errors import AuditError
+from attacks.outcomes import GENERATED, POOLED, Scheme
 from attacks.second_order import (
     Moments,
     as_far_as_faces,
     decoy_moment,
     drawn_towards,
-    likeliest_embeddings,
     moment_on_sphere,
 )
-from templates.contract.canonical import Json
-from templates.contract.levels import Rate
-from templates.decoys import DecoyGenerator, DecoySource
+from templates.contract.document import Calibration, Contract, Level
+from templates.contract.nobody import Nobody
+from templates.decoys import DecoyGenerator, DecoyPool, DecoySource
 from templates.keys.randomness import Keystream
 from templates.space.embedding import normalised
 from templates.space.lifting import Strategy, lift, plain_strategy
 from templates.space.subspace import SubspaceBatch
+from verify.comparisons import through_wire
 from verify.consistency import match_cosine
-from verify.metrics import rate
 
 FACE_COUNTS = (1_000, 5_000)
 MOST_ATTACKED = 600
@@ -39,9 +37,6 @@ LEAST_VICTIMS = 100
 LEAST_FACES = 1_000
 """Of people and of the attacker's faces; with fewer, attacks that are known to work do not. On LFW
 at m = 128, 194 faces found 13 of 40 people, and 3,512 more found 32 of the same."""
-SPHERE_SHARES = (0.15, 0.3, 0.5, 0.7)
-"""Shares of the decoys' moments, beside the sphere's, that templates with random directions are
-attacked with. The best counts; on real faces that was 0.3."""
 DRAWN_PEOPLE = 600
 PHOTOS, ONE_PHOTO, MEANS = "photos", "one photo of each person", "the mean of each person"
 EXACT = "exact moments"
@@ -101,131 +96,180 @@ class Pairs:
         return cls(normalised(enrolled).astype(np.float32), fresh.astype(np.float32))
 
 
-@dataclass(frozen=True)
-class Theft:
-    """What one attacker gets.
+@dataclass(frozen=True, eq=False, repr=False)
+class Attacker:
+    """Second moments of faces, as one attacker knows them.
 
     Parameters
     ----------
-    attack
-        ``foot point`` or ``second moments``.
     faces
         Faces or people that the attacker has; None where it knows their second moments exactly.
     counted
         How it counts them.
-    share
-        Of the decoys' moments beside the sphere's; 1 where all directions lead to decoys.
-    found
-        Templates whose guess matches a fresh photo of the person.
-    control
-        Those whose guess matches the photo of the next person, as should happen by chance only.
     """
-
-    attack: str
-    faces: int | None
-    counted: str
-    share: float
-    found: Rate
-    control: Rate
-
-    def to_json(self) -> dict[str, Json]:
-        """JSON form."""
-        return {
-            "attack": self.attack,
-            "faces": "unlimited, simulated" if self.faces is None else self.faces,
-            "counted": self.counted,
-            "share_of_decoys": self.share,
-            "found": self.found.to_json(),
-            "control": self.control.to_json(),
-        }
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Attacker:
-    """Second moments of faces, as one attacker knows them; see :class:`Theft` for the fields."""
 
     faces: int | None
     counted: str
     moments: Moments
 
 
+@dataclass(frozen=True)
+class Effort:
+    """How hard the attacks that take long try.
+
+    ``climbed``: victims whose template is climbed by scores, in ``attempts`` each.
+    ``training_seconds`` is for the inverter; None trains none.
+    """
+
+    climbed: int = 10
+    attempts: int = 1000
+    training_seconds: float | None = None
+
+
 @dataclass(frozen=True, eq=False, repr=False)
-class TestBed:
-    """People to attack in the coordinates that templates have, and who attacks them.
+class Testbed:
+    """People to attack in the coordinates that templates have, and what an attacker has.
 
     Parameters
     ----------
     victims
-        Of (V, k) rows.
+        Of (V, k) rows; ``victims.enrolled`` is the truth that an attack wants.
+    templates : SubspaceBatch of V
+        One template of each victim, un-rotated unless the runner has turned them.
     source
         Decoys of k numbers.
     decoys
         Their second moments.
+    attackers
+        Those who know second moments, by the faces that they have and how they count them.
+    gallery : (A, k) float32
+        Faces of other people, which the attacker has: one photo of each.
     match_cosine
         Cosine to the fresh photo from which on a guess is a match: raw FMR 1e-3, in the same
         coordinates.
+    drawn
+        People whose second moments an attacker knows exactly: one with unlimited faces. Their
+        victims are drawn, and they have one attacker. None where decoys are a pool's.
+    contract
+        What decides about probes, calibrated on people who are not attacked. None where attacks
+        guess embeddings only.
+    albums
+        Embeddings of all photos, (i, n), of each victim who has three or more.
+    owners
+        People whose ``enrolled`` photos make up the pool of decoys.
+    batches
+        Several templates of each victim, where an attack has them.
+    memory
+        What an attack has learnt, for the same attack on other templates.
     """
 
     __test__ = False
 
     victims: Pairs
+    templates: SubspaceBatch
     source: DecoySource
     decoys: Moments
     attackers: tuple[Attacker, ...]
+    gallery: Array32
     match_cosine: float
+    strategy: Strategy
     seed: int
+    drawn: "Testbed | None" = None
+    contract: Contract | None = None
+    albums: tuple[Array32, ...] = ()
+    owners: Pairs | None = None
+    batches: tuple[SubspaceBatch, ...] = ()
+    effort: Effort = field(default_factory=Effort)
+    memory: dict[object, Any] = field(default_factory=dict)
 
-    def lifted(self, strategy: Strategy, m: int) -> SubspaceBatch:
-        """Lift the victims, with randomness of the seed, and round as the wire format does."""
-        with Keystream.seeded("privacy", self.seed, self.source.k, m) as stream:
-            templates = lift(
-                self.victims.enrolled,
-                strategy=plain_strategy(strategy),
+    @property
+    def m(self) -> int:
+        """Dimension of the templates."""
+        return self.templates.m
+
+    @property
+    def scheme(self) -> Scheme:
+        """How the templates protect."""
+        source = POOLED if isinstance(self.source, DecoyPool) else GENERATED
+        decoys = source if self.strategy.needs_decoys else None
+        return Scheme(
+            self.strategy, decoys, self.m, self.source.k if self.source.k < self.source.n else None
+        )
+
+    @property
+    def pool(self) -> DecoyPool | None:
+        """The pool that the decoys are drawn from; None of another scheme."""
+        of_pool = self.scheme.decoys == POOLED and isinstance(self.source, DecoyPool)
+        return self.source if of_pool and isinstance(self.source, DecoyPool) else None
+
+    def lift(self, points: Array32, *purpose: str | int, m: int | None = None) -> SubspaceBatch:
+        """Lift further points, (N, k), as they are stored; with randomness of this purpose only.
+
+        Strategies that need labels or sub-databases are lifted in their plain form.
+        """
+        m = m or self.m
+        with Keystream.seeded("privacy", self.seed, self.source.k, m, *purpose) as stream:
+            lifted = lift(
+                points,
+                strategy=plain_strategy(self.strategy),
                 m=m,
                 source=self.source,
                 stream=stream,
             )
-        return as_stored(templates)
+        if self.contract is None:
+            return as_stored(lifted)
+        return through_wire(lifted, contract_id=self.contract.contract_id)
 
-    def decoy_forms(self, strategy: Strategy, m: int) -> tuple[tuple[float, Moments], ...]:
-        """Moments of what surrounds an embedding in a template, with the share that is decoys'."""
-        decoys = plain_strategy(strategy).decoys(m)
-        if decoys == m:
-            return ((1.0, self.decoys),)
-        shares = SPHERE_SHARES if decoys else (0.0,)
-        return tuple((share, self.decoys.with_sphere(share)) for share in shares)
+    def at(self, m: int, *purpose: str) -> "Testbed":
+        """Lift the victims anew, with m decoys."""
+        drawn = None if self.drawn is None else self.drawn.at(m, *purpose)
+        return replace(self, templates=self.lift(self.victims.enrolled, *purpose, m=m), drawn=drawn)
 
-    def thefts(self, strategy: Strategy, m: int) -> tuple[Theft, ...]:
-        """What every attacker gets from templates of a strategy and dimension.
+    def first(self, count: int) -> "Testbed":
+        """Return the bed of the first victims only, for attacks that take long."""
+        return replace(self, victims=self.victims[:count], templates=self.templates[:count])
 
-        Parameters
-        ----------
-        strategy
-            Strategies that need labels or sub-databases are lifted in their plain form.
+    @cached_property
+    def renewed(self) -> SubspaceBatch:
+        """Templates of the victims' fresh photos, lifted once."""
+        return self.lift(self.victims.fresh, "renewed from the fresh photo")
+
+    @property
+    def service(self) -> Contract:
+        """The contract that decides.
+
+        Raises
+        ------
+        AuditError
+            There is none: nothing can be presented.
         """
-        templates = self.lifted(strategy, m)
-        feet = templates.feet / np.maximum(templates.foot_norms, 1e-12)[:, None]
-        thefts = [self._theft("foot point", 0, "nothing", 1.0, feet)]
-        for share, decoys in self.decoy_forms(strategy, m):
-            for attacker in self.attackers:
-                guesses = likeliest_embeddings(templates, attacker.moments, decoys)
-                thefts.append(
-                    self._theft("second moments", attacker.faces, attacker.counted, share, guesses)
-                )
-        return tuple(thefts)
+        if self.contract is None:
+            raise AuditError("an attack on the decision needs a contract")
+        return self.contract
 
-    def _theft(
-        self, attack: str, faces: int | None, counted: str, share: float, guesses: Array64 | Array32
-    ) -> Theft:
-        fresh, cosine = self.victims.fresh, self.match_cosine
-        return Theft(
-            attack,
-            faces,
-            counted,
-            share,
-            matches(guesses, fresh, cosine),
-            matches(guesses, np.roll(fresh, 1, axis=0), cosine),
-        )
+    @property
+    def nobody(self) -> Nobody:
+        """Templates of nobody under the contract."""
+        return self.service.nobody(self.source)
+
+    @property
+    def points(self) -> Calibration:
+        """The calibration of raw probes."""
+        return self.service.calibration("p2s")
+
+    @property
+    def lifted(self) -> Calibration | None:
+        """The calibration of lifted probes, of the largest dimension; None where there is none.
+
+        The largest is where lifted wolves open most (docs/method.md §4.7).
+        """
+        calibrations = [one for one in self.service.calibrations if one.mode == "s2s"]
+        return max(calibrations, key=lambda one: one.probe_m, default=None)
+
+    @property
+    def level(self) -> Level:
+        """The level that the service decides with by default."""
+        return self.points.level(self.service.default_level)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -367,13 +411,23 @@ class AttackSetup:
             (MEANS, normalised(sums).astype(np.float32)[shuffled]),
         )
 
-    def along(self, axes: int, *, quick: bool = False) -> TestBed:
-        """Project on the leading axes, and let attackers estimate what they can.
+    def bed(
+        self,
+        strategy: Strategy,
+        *,
+        axes: int,
+        m: int,
+        quick: bool = False,
+        contract: Contract | None = None,
+    ) -> Testbed:
+        """Project on the leading axes, lift the victims, and let attackers estimate what they can.
 
         Parameters
         ----------
         quick
             Only attackers with all faces.
+        contract
+            What decides about probes; None where none are sent.
         """
         source = self.source.reduced(axes)
         decoys = Moments.of(decoy_moment(source))
@@ -384,16 +438,24 @@ class AttackSetup:
                 moments = Moments.of(drawn_towards(rows[:count], decoys.moment))
                 attackers.append(Attacker(count, name, moments))
         names = [str(one) for one in self.owners]
-        return TestBed(
+        nothing = SubspaceBatch(
+            np.empty((0, source.k), np.float32), np.empty((0, m, source.k), np.float32)
+        )
+        bed = Testbed(
             self.victims.along(source),
+            nothing,
             source,
             decoys,
             tuple(attackers),
+            source.project(dict(self.counted).get(ONE_PHOTO, self.faces)),
             match_cosine(source.project(self.faces), names, seed=self.seed),
+            strategy,
             self.seed,
+            contract=contract,
         )
+        return replace(bed, drawn=self._drawn(bed)).at(m)
 
-    def simulated(self, bed: TestBed) -> TestBed | None:
+    def _drawn(self, bed: Testbed) -> Testbed | None:
         """Draw people whose second moments an attacker knows exactly: one with unlimited faces.
 
         Their moments are as far from the decoys' as those of the faces at hand are
@@ -412,11 +474,10 @@ class AttackSetup:
         values, axes = np.linalg.eigh(covariance)
         root = (axes * np.sqrt(np.maximum(values, 0))).T
         rng = np.random.default_rng([self.seed, 2])
-
-        def drawn() -> Array64:
-            return normalised(mean + rng.standard_normal((DRAWN_PEOPLE, len(root))) @ root)
-
-        enrolled, others = drawn(), drawn()
+        enrolled, others = (
+            normalised(mean + rng.standard_normal((DRAWN_PEOPLE, len(root))) @ root)
+            for _ in range(2)
+        )
         others = normalised(others - np.sum(others * enrolled, axis=1, keepdims=True) * enrolled)
         cosines = np.clip(rng.choice(genuine, DRAWN_PEOPLE), -1, 1)[:, None]
         fresh = cosines * enrolled + np.sqrt(1 - cosines**2) * others
@@ -426,14 +487,6 @@ class AttackSetup:
             victims=Pairs(enrolled.astype(np.float32), fresh.astype(np.float32)),
             attackers=(Attacker(None, EXACT, exact),),
         )
-
-
-def all_thefts(setup: AttackSetup, strategy: Strategy, *, axes: int, m: int) -> tuple[Theft, ...]:
-    """What every attacker gets: with faces, from the victims; without limit, from drawn people."""
-    bed = setup.along(axes)
-    drawn = setup.simulated(bed)
-    thefts = bed.thefts(strategy, m)
-    return thefts if drawn is None else (*thefts, *drawn.thefts(strategy, m)[1:])
 
 
 def face_counts(total: int) -> tuple[int, ...]:
@@ -447,11 +500,3 @@ def as_stored(templates: SubspaceBatch) -> SubspaceBatch:
         templates.feet.astype(np.float16).astype(np.float32),
         templates.bases.astype(np.float16).astype(np.float32),
     )
-
-
-def matches(
-    guesses: NDArray[np.floating], fresh: NDArray[np.floating], match_cosine: float
-) -> Rate:
-    """Share of guesses (V, k) that match a fresh photo (V, k)."""
-    hits = np.einsum("ij,ij->i", guesses, fresh) >= match_cosine
-    return rate(int(np.count_nonzero(hits)), len(hits))

@@ -1,7 +1,7 @@
 """Lifted wolves by gradient ascent on the decision, against templates that the attacker lifts.
 
 The attacker knows the algorithm and the thresholds, and lifts faces of their own (targets). Raw
-probes climb as ``attacks.stored.point_ascent`` says, as what is expected of a point is known to
+probes climb as ``attacks.point_ascent`` says, as what is expected of a point is known to
 everybody; for lifted ones the attacker lifts a cohort of nobody like the service's.
 """
 
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from attacks.stored.point_ascent import ROUNDS, accepted_share, step_lengths
+from attacks.point_ascent import ROUNDS, accepted_share, step_lengths
 from templates.contract.document import Level
 from templates.space.embedding import normalised
 from templates.space.subspace import SubspaceBatch
