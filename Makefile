@@ -41,9 +41,11 @@ lint: .venv/dev
 types: .venv/dev
 	$(VENV)/mypy
 
-# The client for browsers and Node, by Node's own tools: needs Node 20 or newer, and npm. What the page runs of it in
-# private mode is put into api/web/client.
-javascript:
+# The client for browsers and Node, by Node's own tools: needs Node 20 or newer, and npm. The types of its answers come from
+# the service's OpenAPI document. What the page runs of it is put into api/web/client.
+javascript: .venv/core
+	$(VENV)/python -c 'import json; from api.http.app import create_app; from api.settings import Settings; \
+		print(json.dumps(create_app(Settings()).openapi()))' > clients/javascript/openapi.json
 	cd clients/javascript && npm ci --no-audit --no-fund && npm run build && npm run page && npm test
 
 # The package as a registry would get it, in dist/npm: installed alone, both of its exports load.

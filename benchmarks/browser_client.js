@@ -119,7 +119,7 @@ window.visit = {
     const client = new PrivateClient(location.origin, token, { runtime: ort });
     const pack = await ModelPack.load(ort, await client.contract(), await client.pack());
     const image = await decodeImage(data);
-    const { crop, embedding } = await pack.embedPhoto(image, { policy: face });
+    const { crop, embedding } = await pack.embedPhoto(image, face);
     await pack.release();
     const floats = new Uint8Array(embedding.buffer, embedding.byteOffset, embedding.byteLength);
     const forms = {

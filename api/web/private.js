@@ -200,10 +200,7 @@ function problemOf(error, photos = 1) {
     });
   }
   // What the page finds out by itself has the status that the service would have given it.
-  if (code === "inconsistent_images") {
-    return new Problem({ status: 422, code, message, details: { photos: error.photos } });
-  }
-  if (code) {
+  if (name === "PhotoError" || code === "lifted_before") {
     const which = image !== undefined && photos > 1 ? `photo ${image + 1} of ${photos}: ` : "";
     return new Problem({ status: 422, code, message: which + message, details: { ...details, image } });
   }

@@ -8,7 +8,7 @@ import { extname } from "node:path";
 import { json } from "node:stream/consumers";
 import { promisify } from "node:util";
 // In a project of yours: "veilface-client"; its files, and those of the runtime, are in node_modules.
-import { Client, NotEnrolled } from "../../clients/javascript/dist/index.js";
+import { Client } from "../../clients/javascript/dist/index.js";
 
 const { VEILFACE_URL, VEILFACE_API_KEY, PORT = "3000" } = process.env;
 const service = VEILFACE_URL.replace(/\/+$/, "");
@@ -54,7 +54,7 @@ async function next(subject) {
     await veilface.describe(subject);
     return { service, action: "verify" };
   } catch (error) {
-    if (error instanceof NotEnrolled) return { service, action: "enroll" };
+    if (error.code === "not_enrolled") return { service, action: "enroll" };
     throw error;
   }
 }

@@ -62,7 +62,7 @@ window.embedded = async (names) => {
   const samples = [];
   for (const name of names) {
     const image = await decodeImage(await (await fetch(`/photos/${name}`)).blob());
-    const { crop, embedding } = await pack.embedPhoto(image, { policy: "dominant" });
+    const { crop, embedding } = await pack.embedPhoto(image);
     samples.push({ crop: [...crop.data], embedding: [...embedding] });
   }
   return samples;
@@ -192,6 +192,7 @@ def test_the_element(
         tab.page.get_by_role("button", name="Start camera").click()
         tab.page.get_by_role("button", name="Log in").click()
         expect(tab.page.locator("veilface-login output")).to_have_text(says)
+        login.evaluate("(each) => each.reset()")
     camera.shows()
     tab.page.get_by_role("button", name="Start camera").click()
     tab.page.get_by_role("button", name="Log in").click()
@@ -236,6 +237,8 @@ def test_the_element_locks_an_enrollment_to_a_passkey(
         tab.page.get_by_role("button", name="Start camera").click()
         tab.page.get_by_role("button", name="Log in").click()
         expect(says).to_have_text("Welcome.")
+        expect(tab.page.get_by_role("button")).to_have_count(0)
+        tab.page.evaluate(f"{login}.reset()")
 
         key = authenticator.holder_key("anna")
         with Client(running.url, running.deployment.token) as client:

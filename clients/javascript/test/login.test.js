@@ -6,7 +6,9 @@ import { test } from "node:test";
 const { VeilfaceLogin: ForServers } = await import("../dist/element/login.js?rendered-by-a-server");
 
 class Part {
-  part = { add() {} };
+  static all = {};
+  part = { add: (name) => (Part.all[name] = this) };
+  append() {}
   attributes = {};
   #clicked = () => {};
   addEventListener(_, listener) { this.#clicked = listener; }
@@ -41,7 +43,7 @@ class Page extends EventTarget {
     this.disconnectedCallback();
   }
   attachShadow() {
-    return { append: (...parts) => ([this.notice, this.video, this.button, this.status] = parts) };
+    return { append: () => Object.assign(this, Part.all) };
   }
 }
 
@@ -59,9 +61,7 @@ Object.assign(globalThis, {
   },
 });
 const { VeilfaceLogin, PasskeyError, WORDS } = await import("../dist/element/login.js");
-const { FAMILIES } = await import("../dist/service/errors.js");
-const { InconsistentImages } = await import("../dist/templates/errors.js");
-const { NoFace, PackError } = await import("../dist/models/errors.js");
+const { ContractError, PhotoError, ServiceError } = await import("../dist/errors.js");
 
 const settled = () => new Promise((resolve) => setTimeout(resolve));
 
@@ -160,7 +160,7 @@ test("graphs are fetched while the person looks, and what failed is tried again 
   await settled();
   assert.deepEqual(asked, [["/v1/contract", "0"]], "while the person looks");
   login.words = { ...login.words, errors: { http_503: "Später." } };
-  await assert.rejects(login.attempt(), { name: "Unavailable" });
+  await assert.rejects(login.attempt(), { code: "http_503" });
   assert.deepEqual(asked[1], ["/v1/contract", "1"], "what failed is tried again");
   login.button.click();
   while (told.length === 0) await settled();
@@ -241,7 +241,7 @@ test("a camera that ends is said and told, and ends the attempt", async () => {
   await settled();
   tracks[0].dispatchEvent(new Event("ended"));
   assert.deepEqual([signal.aborted, login.status.value], [true, login.words.camera]);
-  assert.deepEqual([login.button.textContent, told.map(({ name }) => name)], ["Start camera", ["NotReadableError"]]);
+  assert.deepEqual([login.button.textContent, told.map(({ name }) => name)], ["Try again", ["NotReadableError"]]);
   login.button.click();
   await settled();
   tracks[0].dispatchEvent(new Event("ended"));
@@ -250,20 +250,20 @@ test("a camera that ends is said and told, and ends the attempt", async () => {
 
 test("the camera stays on only where another photo, or the passkey, may help", async () => {
   const { login, tracks, told } = element();
-  const refused = (code, status) => new (FAMILIES[code])({ code, status, message: code });
+  const refused = (code, status) => new ServiceError({ code, status, message: code });
   for (const [error, stopped] of [
-    [new NoFace(), false],
+    [new PhotoError("no_face", "nobody"), false],
     [refused("low_quality", 422), false],
-    [new InconsistentImages([1], [0, 2]), false],
+    [new PhotoError("inconsistent_images", "two"), false],
     [new PasskeyError("passkey_refused", ""), false],
     [new PasskeyError("passkey_unsupported", ""), true],
     [refused("forbidden", 403), true],
     [refused("locked_out", 423), true],
-    [new PackError("not that of the contract"), true],
+    [new ContractError("not that of the contract"), true],
     [new TypeError("a defect"), true],
   ]) {
     login.attempt = async () => { throw error; };
-    if (login.button.textContent === "Start camera") login.button.click();
+    if (login.button.textContent !== "Log in") login.button.click();
     await settled();
     login.button.click();
     while (told.at(-1) !== error) await settled();
@@ -280,7 +280,7 @@ test("who sends frames needs no runtime, and who lifts is told that one is missi
   } };
   await assert.rejects(login.attempt(), /needs the runtime/);
   login.setAttribute("liveness", "head-movements");
-  await assert.rejects(login.attempt(), { name: "Unavailable" });
+  await assert.rejects(login.attempt(), { code: "http_503" });
   assert.deepEqual(asked, ["/v1/challenges"]);
   assert.equal(login.status.attributes["aria-live"], "polite");
 });

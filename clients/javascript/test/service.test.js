@@ -6,17 +6,15 @@ import { inspect } from "node:util";
 import {
   Client,
   ConnectionFailed,
-  Forbidden,
-  LockedOut,
+  DEFAULT_RETRIES,
   newHolderKey,
   PrivateClient,
-  Unavailable,
+  ServiceError,
   UnexpectedAnswer,
 } from "../dist/index.js";
-import { DEFAULT_RETRIES } from "../dist/index.js";
-import * as errors from "../dist/service/errors.js";
-import { LiftInputs, SharedInputs } from "../dist/service/lift-inputs.js";
-import { waitFor } from "../dist/service/retries.js";
+import * as errors from "../dist/errors.js";
+import { Lifter } from "../dist/service/private-client.js";
+import { waitFor } from "../dist/service/sending.js";
 
 const KEY = `vf_${"0".repeat(12)}_${"5e".repeat(32)}`;
 const PHOTOS = [new Blob([Uint8Array.of(1, 2, 3)])];
@@ -46,7 +44,7 @@ const error = (status, code, more = {}) => ({
   body: { error: { code, message: "said", details: { a: 1 } }, request_id: "r1" },
   ...more,
 });
-const decision = { body: { decision: "reject", reason: "no_match", level: "fmr-1e-3" } };
+const decision = { body: { request_id: "r1", decision: "reject", reason: "no_match", level: "fmr-1e-3" } };
 
 test("a rejection is a decision that was not accepted", (t) =>
   answering(t, [decision], async (client, requests) => {
@@ -60,7 +58,7 @@ test("a rejection is a decision that was not accepted", (t) =>
   }));
 
 test("what an enrollment may replace is a header", (t) =>
-  answering(t, [{ body: { template_id: "t", replaced: false } }], async (client, requests) => {
+  answering(t, [{ body: { request_id: "r1", template_id: "t", replaced: false } }], async (client, requests) => {
     const holderKey = newHolderKey();
     for (const replace of [true, false, "t1"]) {
       await client.enroll("anna", PHOTOS, { replace, holderKey });
@@ -78,16 +76,16 @@ test("an overload is waited out, also by a verification", (t) =>
 
 test("a verification that may have been decided is not sent again", (t) =>
   answering(t, [error(503, "store_unavailable")], async (client, requests) => {
-    await assert.rejects(client.verify("anna", PHOTOS), Unavailable);
+    await assert.rejects(client.verify("anna", PHOTOS), { code: "store_unavailable" });
     assert.equal(requests.length, 1);
-    await assert.rejects(client.erase("anna"), Unavailable);
+    await assert.rejects(client.erase("anna"), { code: "store_unavailable" });
     assert.equal(requests.length, 1 + DEFAULT_RETRIES.sendings);
   }));
 
 test("an error has its code, details, request and wait", (t) =>
   answering(t, [error(423, "locked_out", { headers: { "Retry-After": "31" } })], async (client) => {
     await assert.rejects(client.verify("anna", PHOTOS), (raised) => {
-      assert.ok(raised instanceof LockedOut);
+      assert.ok(raised instanceof ServiceError);
       const { code, status, details, requestId, retryAfter } = raised;
       assert.deepEqual([code, status, details, requestId, retryAfter], ["locked_out", 423, { a: 1 }, "r1", 31]);
       return true;
@@ -97,7 +95,7 @@ test("an error has its code, details, request and wait", (t) =>
 test("a proxy's page is not repeated", (t) =>
   answering(t, [{ status: 403, body: `<p>${KEY}</p>` }], async (client) => {
     await assert.rejects(client.contract(), (raised) => {
-      assert.ok(raised instanceof Forbidden);
+      assert.ok(raised instanceof ServiceError);
       assert.equal(raised.code, "http_403");
       assert.ok(!inspect(raised).includes("5e5e"));
       return true;
@@ -105,10 +103,11 @@ test("a proxy's page is not repeated", (t) =>
   }));
 
 test("an answer that is not the service's is none", async (t) => {
-  await answering(t, [{ body: { decision: "maybe", level: "x" } }], (client) =>
+  await answering(t, [{ body: { request_id: "r1", decision: "maybe" } }], (client) =>
     assert.rejects(client.verify("anna", PHOTOS), UnexpectedAnswer));
-  await answering(t, [{ body: "<html>" }], (client) =>
-    assert.rejects(client.contract(), UnexpectedAnswer));
+  for (const body of ["<html>", "null", "[]", { decision: "accept" }]) {
+    await answering(t, [{ body }], (client) => assert.rejects(client.contract(), UnexpectedAnswer));
+  }
   await answering(t, [{ status: 302, headers: { Location: "/elsewhere" } }], (client) =>
     assert.rejects(client.contract(), UnexpectedAnswer));
 });
@@ -117,8 +116,8 @@ test("all subjects come a page at a time", (t) =>
   answering(
     t,
     [
-      { body: { subjects: [{ subject_id: "a" }], next_cursor: "c" } },
-      { body: { subjects: [{ subject_id: "b" }], next_cursor: null } },
+      { body: { request_id: "r1", subjects: [{ subject_id: "a" }], next_cursor: "c" } },
+      { body: { request_id: "r1", subjects: [{ subject_id: "b" }], next_cursor: null } },
     ],
     async (client, requests) => {
       const ids = [];
@@ -131,19 +130,31 @@ test("all subjects come a page at a time", (t) =>
 test("a graph of another hash than was asked for is not taken", (t) =>
   answering(
     t,
-    [{ body: { files: [{ role: "embedder", sha256: "0".repeat(64), bytes: 2 }] } }, { body: "no" }],
+    [{ body: { request_id: "r1", files: [{ role: "embedder", sha256: "0".repeat(64), bytes: 2 }] } }, { body: "no" }],
     (client) => assert.rejects(client.pack(), UnexpectedAnswer),
   ));
 
-test("a wait that is longer than the patience is not waited for", () => {
-  const ask = { sending: 1, resend: "when-lost", retries: DEFAULT_RETRIES };
-  const told = (code, retryAfter) =>
-    new errors.FAMILIES[code]({ code, message: "said", status: 429, retryAfter });
-  assert.equal(waitFor(told("rate_limited", 31), ask), undefined);
-  const wait = waitFor(told("rate_limited", 5), ask);
+test("what may heal is waited for, and nothing longer than the patience", () => {
+  const ask = { sending: 1, call: {}, retries: DEFAULT_RETRIES };
+  const once = { ...ask, call: { onlyOnce: true } };
+  const answered = (code, status, retryAfter) => new ServiceError({ code, message: "said", status, retryAfter });
+  const wait = waitFor(answered("rate_limited", 429, 5), ask);
   assert.ok(wait >= 5 && wait <= 5.25);
-  assert.equal(waitFor(told("locked_out", 1), ask), undefined);
-  assert.equal(waitFor(new ConnectionFailed("lost", true), { ...ask, resend: "when-not-done" }), undefined);
+  const lost = (sent) => new ConnectionFailed("lost", sent);
+  for (const [error, asked, heals] of [
+    [answered("rate_limited", 429, 31), ask, false],
+    [answered("locked_out", 423, 1), ask, false],
+    [answered("overloaded", 503), once, true],
+    [answered("store_unavailable", 503), ask, true],
+    [answered("store_unavailable", 503), once, false],
+    [answered("model_unavailable", 503), ask, false],
+    [lost(true), ask, true],
+    [lost(true), once, false],
+    [lost(false), once, true],
+    [lost(true), { ...ask, sending: DEFAULT_RETRIES.sendings }, false],
+  ]) {
+    assert.equal(waitFor(error, asked) !== undefined, heals, error.code);
+  }
 });
 
 test("keys, URLs and subjects are checked before anything is sent, and keys not repeated", async () => {
@@ -154,11 +165,11 @@ test("keys, URLs and subjects are checked before anything is sent, and keys not 
   const client = new Client("http://host", KEY);
   assert.ok(!inspect(client, { depth: 9 }).includes("5e5e"));
   for (const subject of ["", "..", "a/b", "a".repeat(129)]) {
-    assert.throws(() => client.verify(subject, PHOTOS), RangeError);
+    await assert.rejects(client.verify(subject, PHOTOS), RangeError);
   }
   for (const nothing of [undefined, null, 7]) {
-    assert.throws(() => client.enroll(nothing, PHOTOS), TypeError);
-    assert.throws(() => client.tokenOutcome("anna", nothing), TypeError);
+    await assert.rejects(client.enroll(nothing, PHOTOS), TypeError);
+    await assert.rejects(client.tokenOutcome("anna", nothing), TypeError);
     assert.throws(() => new Client("http://host", nothing), TypeError);
   }
 });
@@ -180,13 +191,9 @@ test("more photos than the service takes are refused before they are sent or emb
     assert.equal(requests.length, 1);
   }));
 
-test("null is no object, and no list", async (t) => {
-  await answering(t, [{ body: { contract_id: "c", binding: null } }], (client) =>
-    assert.rejects(client.contract(), UnexpectedAnswer));
-  await answering(t, [{ body: { subjects: { length: 1 } } }], (client) =>
-    assert.rejects(client.page(), UnexpectedAnswer));
+test("an error with open members keeps what is sound of them", (t) => {
   const body = { error: { code: "forbidden", message: "said", details: null }, request_id: 7 };
-  await answering(t, [{ status: 403, body }], (client) =>
+  return answering(t, [{ status: 403, body }], (client) =>
     assert.rejects(client.contract(), (raised) => {
       assert.deepEqual([raised.details, raised.requestId], [{}, undefined]);
       return true;
@@ -245,38 +252,41 @@ test("a signal ends what runs, and whatever is called after it", async () => {
   assert.equal(sent, 1);
 });
 
-test("what clients share is fetched once, and freed once when nobody needs it", async () => {
-  const released = [];
-  const fetching = (id) => async () =>
-    new LiftInputs({ contract_id: id }, {}, { release: async () => void released.push(id) });
-  const shared = new SharedInputs();
-  shared.join();
-  await assert.rejects(shared.taken(async () => assert.fail("refused")), /refused/);
-  const [one, other] = await Promise.all([shared.taken(fetching("a")), shared.taken(fetching("b"))]);
-  assert.equal(one, other);
-  await one.leave();
-  // One client learns of another contract while the other still lifts by this one.
-  await shared.forget("a");
-  assert.deepEqual(released, []);
-  await other.leave();
-  assert.deepEqual(released, ["a"]);
-  const renewed = await shared.taken(fetching("b"));
-  await shared.forget("a");
-  await renewed.leave();
-  assert.equal(await shared.taken(fetching("c")), renewed, "a sibling does not forget the new one");
-  await renewed.leave();
-  await shared.leave();
-  assert.deepEqual(released, ["a"]);
-  await shared.leave();
-  assert.deepEqual(released, ["a", "b"]);
-  await assert.rejects(shared.taken(fetching("d")), /closed/);
+test("what a contract lifts with is freed once it is retired and no lift uses it", async () => {
+  let released = 0;
+  const lifter = new Lifter({}, {}, { release: async () => void released++ });
+  let end;
+  const lift = lifter.use(() => new Promise((resolve) => (end = resolve)));
+  await lifter.use(async () => undefined);
+  await lifter.retire();
+  assert.deepEqual([lifter.isRetired, released], [true, 0], "a lift still uses it");
+  end("lifted");
+  assert.deepEqual([await lift, released], ["lifted", 1]);
+  await lifter.retire();
+  assert.equal(released, 1);
+});
+
+test("clients that share what they fetched fetch it once, and again after a failure", async () => {
+  let asked = 0;
+  const fetch = async () => {
+    asked++;
+    return new Response("", { status: 403 });
+  };
+  const client = new PrivateClient("http://host", KEY, { runtime: {}, fetch });
+  const other = client.as(KEY);
+  const both = await Promise.allSettled([client.prepare(), other.prepare()]);
+  assert.deepEqual([both.map(({ status }) => status), asked], [["rejected", "rejected"], 1]);
+  await client.close();
+  await assert.rejects(client.prepare(), /closed/);
+  await assert.rejects(other.prepare(), ServiceError);
+  assert.equal(asked, 2);
 });
 
 test("a client that is closed while its preparation fails says nothing, and is closed", async () => {
   const retries = { sendings: 1 };
   const fetch = async () => new Response("", { status: 503 });
   const client = new PrivateClient("http://host", KEY, { runtime: {}, retries, fetch });
-  const preparing = assert.rejects(client.prepare(), Unavailable);
+  const preparing = assert.rejects(client.prepare(), { code: "http_503" });
   await client.close();
   await preparing;
   await assert.rejects(client.prepare(), /closed/);

@@ -1,17 +1,18 @@
 /** `<veilface-login>`: camera, burst or head movements, decision, for any page. */
 
-import { FaceError } from "../models/errors.js";
+import type { Decision, Enrollment } from "../answers.js";
+import { isPhotoRefused, PasskeyError, VeilfaceError } from "../errors.js";
+import type { FacePolicy } from "../models/faces.js";
 import { fromImageData, type RgbImage } from "../models/image.js";
-import type { FacePolicy } from "../models/selection.js";
-import type { Decision, Enrollment } from "../service/answers.js";
+import type { PhotoCheck } from "../models/pack.js";
 import { Client } from "../service/client.js";
-import { ContractMismatch, PhotoRefused } from "../service/errors.js";
-import { Enrollable, type Probe } from "../service/lifts.js";
-import { PrivateClient, type PrivateOptions } from "../service/private-client.js";
-import { InconsistentImages } from "../templates/errors.js";
-import { createPasskey, passkeyHolderKey, PasskeyError, type Passkey } from "./passkey.js";
+import { createPasskey, passkeyHolderKey, type Passkey } from "../service/passkey.js";
+import { PrivateClient, type Lift, type PrivateOptions } from "../service/private-client.js";
+import { STYLE, type State } from "./look.js";
+import { withDefaults, type Words } from "./words.js";
 
-export { PasskeyError } from "./passkey.js";
+export { PasskeyError } from "../errors.js";
+export { WORDS, type Words } from "./words.js";
 
 /** What the page's server says when a person wants to log in: whose token it is, and the token. */
 export interface Authorization {
@@ -25,98 +26,36 @@ export interface Authorization {
 export type LoginOptions = Omit<PrivateOptions, "signal" | "runtime"> &
   Partial<Pick<PrivateOptions, "runtime">>;
 
-/** What the element says to the person. */
-export interface Words {
-  readonly start: string;
-  readonly take: string;
-  readonly enroll: string;
-  readonly waiting: string;
-  readonly working: string;
-  readonly passkey: string;
-  readonly accept: string;
-  readonly reject: string;
-  readonly enrolled: string;
-  readonly camera: string;
-  /** What a screen reader calls the picture of the camera. */
-  readonly video: string;
-  /** Shown as long as verifications send photos, so before the camera starts. */
-  readonly frames: string;
-  /** By their names in a challenge, and `front` and `move_back`. */
-  readonly movements: Readonly<Record<string, string>>;
-  readonly notLive: string;
-  /** The service asks for liveness, and the page for none. */
-  readonly liveness: string;
-  /** By an error's `code`, or its `name` where it has none; the error's message for all others. */
-  readonly errors: Readonly<Record<string, string>>;
-}
-
-/** The texts in English; give others for another language. */
-export const WORDS: Words = {
-  start: "Start camera",
-  take: "Log in",
-  enroll: "Enroll",
-  waiting: "Look into the camera.",
-  working: "One moment …",
-  passkey: "Use your passkey.",
-  accept: "Welcome.",
-  reject: "That did not match. Try again.",
-  enrolled: "You are enrolled.",
-  camera: "The camera cannot be used.",
-  video: "Your camera",
-  frames:
-    "To log in, move your head as you are asked to, for about 12 seconds. Photos of that are sent to the service.",
-  movements: {
-    front: "Look straight ahead.",
-    move_back: "Move back and look straight ahead.",
-    turn_left: "Turn your head to the left.",
-    turn_right: "Turn your head to the right.",
-    look_up: "Look up.",
-    look_down: "Look down.",
-    come_closer: "Come closer.",
-  },
-  notLive: "The movements were not seen. Follow each of them, in good light.",
-  liveness: "This service checks that a face is live, which takes photos. This page sends none.",
-  errors: {},
-};
-
-const STYLE = `
-:host { display: inline-block; font: inherit; max-width: 100%; }
-video { display: block; width: var(--veilface-width, 20rem); max-width: 100%; aspect-ratio: 4 / 3;
-  background: var(--veilface-background, #222); object-fit: cover; transform: scaleX(-1); }
-button { font: inherit; margin: 0.5rem 0; }
-output { display: block; min-height: 1.5em; }
-p { margin: 0.5rem 0; }
-p:empty { display: none; }
-`;
-
 const BURST = 3;
 const BETWEEN_FRAMES = 150; // milliseconds, so that the frames are not one picture three times
 // Of a movement, as on the service's own page: two frames on the way out, one back at the front.
 const READY = 2500;
 const OUT = [1200, 600];
 const BACK = 1300;
+const BETWEEN_LOOKS = 600;
+// What went wrong is left to be read before guidance goes on.
+const READING = 5000;
 
 const after = (milliseconds: number): Promise<void> =>
   new Promise((resolve) => setTimeout(resolve, milliseconds));
 
 /** Another photo may help, or the passkey after all; for all else no camera is needed. */
-const mendable = (error: unknown): boolean =>
-  error instanceof FaceError ||
-  error instanceof InconsistentImages ||
-  error instanceof PhotoRefused ||
-  (error instanceof PasskeyError && error.code === "passkey_refused");
+const isMendable = (error: unknown): boolean =>
+  isPhotoRefused(error) || (error instanceof PasskeyError && error.code === "passkey_refused");
 
 // A server that renders pages imports this module too, and has no elements.
 const Base = globalThis.HTMLElement ?? (class {} as typeof HTMLElement);
 
 /**
- * The element. Set `options` and `authorize`; then it asks for the camera when it is told to, takes
- * a burst, lifts it in the page, sends the template alone, and tells the page by an event:
- * `veilface-result` with the decision (or enrollment) as its detail, `veilface-error` with the error.
+ * The element. Set `options` and `authorize`; then it asks for the camera when the person starts it,
+ * says how the face is to be held, takes a burst, lifts it in the page, sends the template alone, and
+ * tells the page by an event: `veilface-result` with the decision (or enrollment) as its detail,
+ * `veilface-error` with the error.
  *
  * The attribute `service` is the service's URL, by default the page's own origin; `action` is
- * `verify` (by default) or `enroll`; `face` is a {@link FacePolicy}, by default `dominant`. With the attribute `passkey` an enrollment makes one and is locked to the key that it gives,
- * and a verification asks for it. Parts for styling: `notice`, `video`, `button`, `status`.
+ * `verify` (by default) or `enroll`; `face` is a {@link FacePolicy}, by default `dominant`. With the
+ * attribute `passkey` an enrollment makes one and is locked to the key that it gives, and a
+ * verification asks for it. Parts for styling: `card`, `notice`, `viewfinder`, `video`, `status`, `button`.
  *
  * With `liveness="head-movements"` a verification sends no private template: it answers a challenge, by
  * frames that are sent as photos, and `words.frames` says so. An enrollment stays private.
@@ -138,11 +77,14 @@ export class VeilfaceLogin extends Base {
    */
   declare authorize: (() => Promise<Authorization>) | undefined;
 
-  #words = WORDS;
-  readonly #notice = document.createElement("p");
-  readonly #video = document.createElement("video");
-  readonly #button = document.createElement("button");
-  readonly #status = document.createElement("output");
+  #words = withDefaults({});
+  readonly #card = part("section", "card");
+  readonly #notice = part("p", "notice");
+  readonly #video = part("video", "video");
+  readonly #status = part("output", "status");
+  readonly #button = part("button", "button");
+  #state: State = "off";
+  #quietUntil = 0;
   #camera: MediaStream | undefined;
   // Graphs stay loaded from one attempt to the next.
   #client: Promise<PrivateClient> | undefined;
@@ -160,15 +102,14 @@ export class VeilfaceLogin extends Base {
     root.adoptedStyleSheets = [sheet];
     this.#video.muted = true;
     this.#video.playsInline = true;
-    this.#notice.part.add("notice");
     this.#notice.id = "notice";
-    this.#video.part.add("video");
     this.#button.type = "button";
     this.#button.setAttribute("aria-describedby", this.#notice.id);
-    this.#button.part.add("button");
-    this.#status.part.add("status");
-    root.append(this.#notice, this.#video, this.#button, this.#status);
     this.#button.addEventListener("click", () => void this.#clicked());
+    const viewfinder = part("div", "viewfinder");
+    viewfinder.append(this.#video);
+    this.#card.append(this.#notice, viewfinder, this.#status, this.#button);
+    root.append(this.#card);
     if (Object.hasOwn(this, "words")) {
       const { words } = this;
       // It hides the accessor.
@@ -183,8 +124,7 @@ export class VeilfaceLogin extends Base {
   }
 
   set words(given: Partial<Words>) {
-    const movements = { ...WORDS.movements, ...given.movements };
-    this.#words = { ...WORDS, ...given, movements };
+    this.#words = withDefaults(given);
     this.#show();
   }
 
@@ -193,36 +133,22 @@ export class VeilfaceLogin extends Base {
     this.#show();
   }
 
-  /** What is sent changes: the camera starts again once the person has read it. */
-  attributeChangedCallback(_: string, old: string | null, now: string | null): void {
-    if (old !== now && this.isConnected) this.#restart();
-  }
-
-  #restart(): void {
-    this.disconnectedCallback();
-    this.connectedCallback();
-  }
-
-  /** What is on the page whatever the person does: the button's text, what is sent, the video's name. */
-  #show(): void {
-    const { start, take, enroll, frames, video } = this.words;
-    this.#button.textContent =
-      this.#camera === undefined ? start : this.#enrolls ? enroll : take;
-    this.#notice.textContent = this.#sendsFrames ? frames : "";
-    this.#video.setAttribute("aria-label", video);
-  }
-
   disconnectedCallback(): void {
     this.#stay.abort();
     this.#stop();
-    this.#say("");
+    this.#enter("off", "");
     void this.#forgetClient();
   }
 
-  async #forgetClient(): Promise<void> {
-    const client = this.#client;
-    this.#client = undefined;
-    await client?.then((each) => each.close()).catch(() => undefined);
+  /** What is sent changes: the camera starts again once the person has read it. */
+  attributeChangedCallback(_: string, old: string | null, now: string | null): void {
+    if (old !== now && this.isConnected) this.reset();
+  }
+
+  /** Go back to the start, from whatever goes on: the camera is off, and nothing is said. */
+  reset(): void {
+    this.disconnectedCallback();
+    this.connectedCallback();
   }
 
   get #sendsFrames(): boolean {
@@ -238,6 +164,10 @@ export class VeilfaceLogin extends Base {
     return face === "largest" || face === "single" ? face : "dominant";
   }
 
+  get #url(): string {
+    return this.getAttribute("service") ?? location.origin;
+  }
+
   /**
    * Take a burst, lift and send it, or answer a challenge; the decision (or enrollment) also comes
    * as an event.
@@ -247,12 +177,14 @@ export class VeilfaceLogin extends Base {
     this.#given();
     signal.throwIfAborted();
     if (this.#sendsFrames) return this.#challenged(signal);
+    this.#enter("busy", this.words.hold);
     const photos = await this.#burst(signal);
+    this.#enter("busy", this.words.working);
     const lift = await this.#lifted(photos, signal);
     try {
       return await this.#send(lift, signal);
     } catch (error) {
-      if (!(error instanceof ContractMismatch)) throw error;
+      if (!(error instanceof VeilfaceError) || error.code !== "contract_mismatch") throw error;
       signal.throwIfAborted();
       await this.#forgetClient();
       const again = await this.#lifted(photos, signal);
@@ -263,11 +195,27 @@ export class VeilfaceLogin extends Base {
   }
 
   /** Before a token or a passkey is asked for: the photos may not do. */
-  async #lifted(photos: RgbImage[], signal: AbortSignal): Promise<Enrollable | Probe> {
+  async #lifted(photos: RgbImage[], signal: AbortSignal): Promise<Lift> {
     const client = await this.#prepared(signal);
     signal.throwIfAborted();
     const face = this.#face;
     return this.#enrolls ? client.liftEnrollment(photos, { face }) : client.lift(photos, { face });
+  }
+
+  async #send(lift: Lift, signal: AbortSignal): Promise<Decision | Enrollment> {
+    const prepared = await this.#prepared(signal);
+    const { subject, token, holderKey } = await this.#authorized(signal, lift.kind === "enrollment");
+    const client = prepared.as(token);
+    try {
+      const more = holderKey && { holderKey };
+      const result = await (lift.kind === "enrollment"
+        ? client.enroll(subject, lift, more)
+        : client.verify(subject, lift, more));
+      signal.throwIfAborted();
+      return result;
+    } finally {
+      await client.close();
+    }
   }
 
   /**
@@ -276,17 +224,15 @@ export class VeilfaceLogin extends Base {
    * It does not wait until it sees one: a recording that shows all in turn would be waited for, too.
    */
   async #challenged(signal: AbortSignal): Promise<Decision> {
-    const { options, authorize } = this.#given();
+    const { options } = this.#given();
     if (!this.words.frames?.trim()) {
       throw new Error("<veilface-login> sends no photo where words.frames does not say so");
     }
-    const { subject, token, ...given } = await authorize();
-    signal.throwIfAborted();
-    const holderKey = given.holderKey ?? (await this.#holderKey(subject, false, signal));
+    const { subject, token, holderKey } = await this.#authorized(signal, false);
     const client = new Client(this.#url, token, { ...options, signal });
     const ask = (movement: string): void => {
       signal.throwIfAborted();
-      this.#say(this.words.movements[movement] ?? movement);
+      this.#enter("moving", this.words.movements[movement] ?? movement);
     };
     const snap = async (wait = 0): Promise<Blob> => {
       await after(wait);
@@ -307,7 +253,7 @@ export class VeilfaceLogin extends Base {
         frames.push(await snap(BACK));
       }
       signal.throwIfAborted();
-      this.#say(this.words.working);
+      this.#enter("busy", this.words.working);
       const more = { challenge, face: this.#face };
       return await client.verify(subject, frames, holderKey ? { ...more, holderKey } : more);
     } finally {
@@ -315,26 +261,14 @@ export class VeilfaceLogin extends Base {
     }
   }
 
-  async #send(lift: Enrollable | Probe, signal: AbortSignal): Promise<Decision | Enrollment> {
-    const { authorize } = this.#given();
-    const prepared = await this.#prepared(signal);
+  /** A token of the page's server, and the holder key that goes with it, where there is one. */
+  async #authorized(signal: AbortSignal, enrolls: boolean): Promise<Authorization> {
     signal.throwIfAborted();
-    const { subject, token, ...given } = await authorize();
+    const { subject, token, ...more } = await this.#given().authorize();
     signal.throwIfAborted();
-    const holderKey =
-      given.holderKey ?? (await this.#holderKey(subject, lift instanceof Enrollable, signal));
+    const holderKey = more.holderKey ?? (await this.#holderKey(subject, enrolls, signal));
     signal.throwIfAborted();
-    const client = prepared.as(token);
-    try {
-      const more = holderKey && { holderKey };
-      const result = await (lift instanceof Enrollable
-        ? client.enroll(subject, lift, more)
-        : client.verify(subject, lift, more));
-      signal.throwIfAborted();
-      return result;
-    } finally {
-      await client.close();
-    }
+    return { subject, token, ...(holderKey && { holderKey }) };
   }
 
   /** The key of the person's passkey, where one is to be asked for. */
@@ -344,13 +278,13 @@ export class VeilfaceLogin extends Base {
     signal: AbortSignal,
   ): Promise<Uint8Array | undefined> {
     if (this.getAttribute("passkey") === null) return undefined;
-    this.#say(this.words.passkey);
+    this.#enter("busy", this.words.passkey);
     if (enrolls && this.#passkey?.subject !== subject) {
       this.#passkey = await createPasskey(subject, signal);
     }
     try {
       const key = await passkeyHolderKey(subject, signal, enrolls ? this.#passkey : undefined);
-      this.#say(this.words.working);
+      this.#enter("busy", this.words.working);
       return key;
     } catch (error) {
       // It will not do the next time either.
@@ -359,10 +293,6 @@ export class VeilfaceLogin extends Base {
       }
       throw error;
     }
-  }
-
-  get #url(): string {
-    return this.getAttribute("service") ?? location.origin;
   }
 
   #given(): { options: LoginOptions; authorize: () => Promise<Authorization> } {
@@ -400,6 +330,12 @@ export class VeilfaceLogin extends Base {
     }
   }
 
+  async #forgetClient(): Promise<void> {
+    const client = this.#client;
+    this.#client = undefined;
+    await client?.then((each) => each.close()).catch(() => undefined);
+  }
+
   async #clicked(): Promise<void> {
     this.#button.disabled = true;
     try {
@@ -428,38 +364,66 @@ export class VeilfaceLogin extends Base {
       this.#video.srcObject = camera;
       await this.#video.play();
       if (signal.aborted) return;
+      this.#enter("searching", this.words.waiting);
+      if (!this.#sendsFrames) void this.#guide(camera, signal);
     } catch (error) {
       if (signal.aborted) return;
-      this.#stop();
-      this.#say(this.words.camera);
-      this.#tell("veilface-error", error);
-      return;
+      this.#failed(error, this.words.camera);
     }
-    this.#show();
-    this.#say(this.words.waiting);
-    if (this.#sendsFrames) return;
-    // While the person looks; the attempt waits for it, and tells what went wrong.
-    this.#prepared(signal).catch(() => undefined);
+  }
+
+  /** Say how to hold the face as long as nothing else goes on; the graphs come meanwhile. */
+  async #guide(camera: MediaStream, signal: AbortSignal): Promise<void> {
+    try {
+      const client = await this.#prepared(signal);
+      while (!signal.aborted && this.#camera === camera) {
+        if (this.#isIdle && !document.hidden) {
+          const seen = await client.check(this.#photo(signal), { face: this.#face });
+          if (this.#isIdle && this.#camera === camera) this.#guided(seen);
+        }
+        await after(BETWEEN_LOOKS);
+      }
+    } catch {
+      // The attempt waits for the same, and tells what went wrong.
+    }
+  }
+
+  get #isIdle(): boolean {
+    return ["searching", "ready", "failed"].includes(this.#state) && Date.now() >= this.#quietUntil;
+  }
+
+  #guided({ usable, code, details, message }: PhotoCheck): void {
+    const { hints, ready } = this.words;
+    const known = [String(code), ...Object.keys(details)].find((name) => Object.hasOwn(hints, name));
+    if (usable) this.#enter("ready", ready);
+    else this.#enter("searching", known === undefined ? message : hints[known]);
   }
 
   async #try(): Promise<void> {
     const { signal } = this.#stay;
-    this.#say(this.words.working);
     try {
       const result = await this.attempt();
       if (signal.aborted) return;
       this.#stop();
       const { accept, reject, notLive, enrolled } = this.words;
-      if (!("accepted" in result)) this.#say(enrolled);
-      else if (result.accepted) this.#say(accept);
-      else this.#say(result.reason === "liveness" ? notLive : reject);
+      const isRejected = "accepted" in result && !result.accepted;
+      const welcome = "accepted" in result ? accept : enrolled;
+      // A page that says nothing itself waits for what its own server says.
+      if (!isRejected) this.#enter(welcome === "" ? "off" : "accepted", welcome);
+      else this.#enter("rejected", result.reason === "liveness" ? notLive : reject);
       this.#tell("veilface-result", result);
     } catch (error) {
       if (signal.aborted) return;
-      if (!mendable(error)) this.#stop();
-      this.#say(this.#wordsOf(error));
-      this.#tell("veilface-error", error);
+      this.#failed(error, this.#wordsOf(error));
     }
+  }
+
+  /** Say and tell what went wrong; the camera stays on only where another photo may help. */
+  #failed(error: unknown, text: string): void {
+    if (!isMendable(error)) this.#stop();
+    this.#quietUntil = Date.now() + READING;
+    this.#enter("failed", text);
+    this.#tell("veilface-error", error);
   }
 
   /** The frames of a moment, as the camera gives them, not mirrored. */
@@ -467,11 +431,15 @@ export class VeilfaceLogin extends Base {
     const photos: RgbImage[] = [];
     for (let frame = 0; frame < BURST; frame++) {
       if (frame > 0) await after(BETWEEN_FRAMES);
-      const context = this.#drawn(signal);
-      const { width, height } = context.canvas;
-      photos.push(fromImageData(context.getImageData(0, 0, width, height)));
+      photos.push(this.#photo(signal));
     }
     return photos;
+  }
+
+  #photo(signal: AbortSignal): RgbImage {
+    const context = this.#drawn(signal);
+    const { width, height } = context.canvas;
+    return fromImageData(context.getImageData(0, 0, width, height));
   }
 
   /** What the camera shows now. */
@@ -489,33 +457,56 @@ export class VeilfaceLogin extends Base {
   /** It was unplugged, forbidden, or taken by another program. */
   #ended(camera: MediaStream): void {
     if (this.#camera !== camera) return;
-    this.#restart();
-    this.#say(this.words.camera);
-    this.#tell("veilface-error", new DOMException("the camera has stopped", "NotReadableError"));
+    this.reset();
+    const error = new DOMException("the camera has stopped", "NotReadableError");
+    this.#failed(error, this.words.camera);
   }
 
   #stop(): void {
     this.#camera?.getTracks().forEach((track) => track.stop());
     this.#camera = undefined;
     this.#video.srcObject = null;
+  }
+
+  /** What is on the page whatever the person does: the button, what is sent, the video's name. */
+  #show(): void {
+    const { start, take, enroll, again, frames, video } = this.words;
+    const isOn = this.#camera !== undefined;
+    const first = this.#state === "rejected" || this.#state === "failed" ? again : start;
+    this.#button.textContent = !isOn ? first : this.#enrolls ? enroll : take;
+    this.#button.hidden = this.#state === "accepted";
+    this.#notice.textContent = this.#sendsFrames ? frames : "";
+    this.#video.setAttribute("aria-label", video);
+    this.#video.hidden = !isOn;
+    this.#card.className = `card ${this.#state}${isOn ? " on" : ""}`;
+  }
+
+  /** Show a state, and say this; what is said already is not said again. */
+  #enter(state: State, text: string): void {
+    this.#state = state;
+    if (this.#status.value !== text) this.#status.value = text;
     this.#show();
   }
 
   #wordsOf(error: unknown): string {
     if (!(error instanceof Error)) return String(error);
-    const { code, details, name } = error as Error & { code?: unknown; details?: { liveness?: string } };
+    const { code, details } = error as Error & { code?: unknown; details?: { liveness?: string } };
     if (details?.liveness !== undefined && !this.#sendsFrames) return this.words.liveness;
-    const key = typeof code === "string" ? code : name;
-    return Object.hasOwn(this.words.errors, key) ? this.words.errors[key] : error.message;
-  }
-
-  #say(text: string): void {
-    this.#status.value = text;
+    const { errors } = this.words;
+    return typeof code === "string" && Object.hasOwn(errors, code) ? errors[code] : error.message;
   }
 
   #tell(event: string, detail: unknown): void {
     this.dispatchEvent(new CustomEvent(event, { detail, bubbles: true, composed: true }));
   }
+}
+
+/** An element of the card, by whose name a page may style it. */
+function part<K extends keyof HTMLElementTagNameMap>(tag: K, name: string): HTMLElementTagNameMap[K] {
+  const element = document.createElement(tag);
+  element.className = name;
+  element.part.add(name);
+  return element;
 }
 
 /** Make the element known to the page. */

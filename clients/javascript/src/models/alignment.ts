@@ -1,7 +1,7 @@
 /** Warp a face onto the common five-point template of ArcFace. */
 
-import type { Point } from "./boxes.js";
-import { PackError } from "./errors.js";
+import { ContractError } from "../errors.js";
+import type { Point } from "./faces.js";
 import { warpAffine, type Affine, type RgbImage } from "./image.js";
 
 // Left eye, right eye, nose, left and right mouth corner as the viewer sees them, for 112 x 112.
@@ -19,7 +19,7 @@ export const TEMPLATE_NAME = "arcface-112";
 export function template(size: number): Point[] {
   const [ratio, move] = size % 112 === 0 ? [size / 112, 0] : [size / 128, (8 * size) / 128];
   if (size <= 0 || (size % 112 !== 0 && size % 128 !== 0)) {
-    throw new PackError(`there is no common alignment template for a ${size} x ${size} embedder`);
+    throw new ContractError(`there is no common alignment template for a ${size} x ${size} embedder`);
   }
   return TEMPLATE_112.map(([x, y]) => [x * ratio + move, y * ratio]);
 }

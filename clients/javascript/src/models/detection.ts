@@ -1,18 +1,21 @@
-/** What every face detector does alike: the canvas, and which canvas speaks for which face. */
+/** Face detectors, and which canvas speaks for which face: `models/detection.py`, where the reasons stand. */
 
+import { ContractError } from "../errors.js";
+import { SCRFD, YUNET, type DetectorFamily } from "./detectors.js";
 import {
   boxHeight,
   boxWidth,
   intersectionOverUnion,
+  longerSide,
   nonMaximumSuppression,
   type Box,
   type Face,
   type Point,
-} from "./boxes.js";
+} from "./faces.js";
 import { placed, resizeArea, resizeLinear, roundHalfEven, type RgbImage } from "./image.js";
+import { planes, type Graph } from "./runtime.js";
 
 export const DEFAULT_SIZE = 640;
-// As in `models/detection.py`, where the reason for each number stands.
 const NEAR_SIZE = 320;
 const SCOUT_SIZE = 128;
 const LARGEST_FACE = 480;
@@ -25,33 +28,72 @@ const LEAST_SPREAD = 1.0;
 /** Height and width. */
 export type Size = readonly [number, number];
 
-/** A face detector with five points per face. */
-export interface Detector {
-  readonly kind: "scrfd" | "yunet";
+/** A detection graph with five points per face. */
+export class Detector {
+  readonly family: DetectorFamily;
+  /** The canvas that the graph accepts, if it accepts no other. */
+  readonly fixed: Size | undefined;
+  /** The main canvas and, below it, the near one; only the graph's own where it has one. */
   readonly sizes: readonly Size[];
-  readonly recommendedScore: number;
-  readonly clearScore: number;
-  /** Whether the graph accepts no other canvas. */
-  readonly isFixed: boolean;
-  /** The canvas that a pass of `size` really takes for `image`. */
-  canvas(image: RgbImage, size: Size): Size;
-  /** Faces found in one pass on a canvas of `size`, in pixels of `image`. */
-  detectOnce(image: RgbImage, size: Size): Promise<Face[]>;
-  release(): Promise<void>;
+
+  /** @param size side of the main canvas, unless the graph fixes it. */
+  constructor(
+    private readonly graph: Graph,
+    size: number,
+  ) {
+    const family = [YUNET, SCRFD].find(({ isOf }) => isOf(graph.outputNames));
+    if (family === undefined) {
+      throw new ContractError("the detector is neither SCRFD with five points nor YuNet");
+    }
+    this.family = family;
+    const [, , height, width] = graph.inputShape;
+    this.fixed = height !== undefined && width !== undefined ? [height, width] : undefined;
+    const sides = size <= NEAR_SIZE ? [size] : [size, NEAR_SIZE];
+    this.sizes = this.fixed ? [this.fixed] : sides.map((side): Size => [side, side]);
+  }
+
+  /** The canvas that a pass of `size` takes for `image`. */
+  canvas(image: RgbImage, size: Size): Size {
+    return this.family.trims ? (this.fixed ?? trimmed(image, size)) : size;
+  }
+
+  /** Find faces in one pass on a canvas of `size`, in pixels of `image`. */
+  async detectOnce(image: RgbImage, asked: Size): Promise<Face[]> {
+    const { family } = this;
+    const size = this.canvas(image, asked);
+    const { canvas, scale } = letterbox(image, size, !family.trims);
+    const blob = planes(canvas, family.order, Array(3).fill(family.mean), Array(3).fill(family.factor));
+    const outputs = await this.graph.run(blob, [1, 3, size[0], size[1]]);
+    const kept = nonMaximumSuppression(family.candidates(outputs, size).filter(isSound), family.overlap);
+    return kept.map((face) => moved(face, 1 / scale, 1 / scale, 0, 0));
+  }
+
+  release(): Promise<void> {
+    return this.graph.release();
+  }
 }
 
-/** The main canvas and, below it, the near one; only the graph's own where it has one. */
-export function canvasSizes(size: number, fixed: Size | undefined): readonly Size[] {
-  if (fixed !== undefined) return [fixed];
-  const main: Size = [size, size];
-  return size <= NEAR_SIZE ? [main] : [main, [NEAR_SIZE, NEAR_SIZE]];
+/** A wild regression must not reach the alignment, which divides by the spread of the points. */
+function isSound({ box, keypoints }: Face): boolean {
+  const [xs, ys] = [0, 1].map((axis) => keypoints.map((point) => point[axis]));
+  const spread = (values: number[]): number => Math.max(...values) - Math.min(...values);
+  return (
+    [...box, ...xs, ...ys].every(Number.isFinite) &&
+    boxWidth(box) > 0 &&
+    boxHeight(box) > 0 &&
+    Math.max(spread(xs), spread(ys)) > LEAST_SPREAD
+  );
 }
 
-/**
- * Detect each face on the canvas that shows it at a size the detector knows, best score first.
- *
- * The rule, and why it is so, is that of `find_faces` in `models/detection.py`.
- */
+/** Smallest canvas of whole 32-pixel blocks that holds the picture, at most `size`. */
+function trimmed(image: RgbImage, size: Size): Size {
+  const scale = Math.min(size[0] / image.height, size[1] / image.width, 1);
+  const blocks = (side: number, most: number): number =>
+    Math.min(most, Math.max(32, Math.ceil(roundHalfEven(side * scale) / 32) * 32));
+  return [blocks(image.height, size[0]), blocks(image.width, size[1])];
+}
+
+/** Detect each face on the canvas that shows it at a size the detector knows, best score first. */
 export async function findFaces(detector: Detector, image: RgbImage): Promise<Face[]> {
   const main = detector.sizes[0];
   const near = detector.sizes[detector.sizes.length - 1];
@@ -66,7 +108,7 @@ export async function findFaces(detector: Detector, image: RgbImage): Promise<Fa
   const longest = Math.max(image.height, image.width);
   const sight = (LARGEST_FACE / widest) * longest;
   const blind = large.some((face) => longerSide(face) > sight);
-  const sure = detector.recommendedScore;
+  const sure = detector.family.recommendedScore;
   let onMain: Face[] = [];
   // Otherwise the near canvas shows all that such a picture has.
   if (!blind || longest > Math.max(...near)) {
@@ -101,11 +143,8 @@ async function largeFaces(detector: Detector, image: RgbImage): Promise<Face[]> 
 }
 
 /** Whether one of `others` is the same face. */
-function among(face: Face, others: readonly Face[]): boolean {
-  return others.some((other) => intersectionOverUnion(face.box, other.box) > SAME_FACE);
-}
-
-const longerSide = (face: Face): number => Math.max(boxWidth(face.box), boxHeight(face.box));
+const among = (face: Face, others: readonly Face[]): boolean =>
+  others.some((other) => intersectionOverUnion(face.box, other.box) > SAME_FACE);
 
 /** Faces found with a black border around the picture, in pixels of `image`. */
 async function insideBorder(detector: Detector, image: RgbImage, main: Size): Promise<Face[]> {
@@ -159,26 +198,4 @@ export function letterbox(
   }
   const resized = resizeLinear(image, width, height);
   return { canvas: placed(resized, size[1], size[0]), scale: height / image.height };
-}
-
-/** Drop candidates that are not sound, suppress duplicates, return to image pixels. */
-export function facesFromCandidates(
-  candidates: readonly Face[],
-  overlap: number,
-  scale: number,
-): Face[] {
-  const kept = nonMaximumSuppression(candidates.filter(isSound), overlap);
-  return kept.map((face) => moved(face, 1 / scale, 1 / scale, 0, 0));
-}
-
-/** A wild regression must not reach the alignment, which divides by the spread of the points. */
-function isSound(face: Face): boolean {
-  const [xs, ys] = [0, 1].map((axis) => face.keypoints.map((point) => point[axis]));
-  const spread = (values: number[]): number => Math.max(...values) - Math.min(...values);
-  return (
-    [...face.box, ...xs, ...ys].every(Number.isFinite) &&
-    boxWidth(face.box) > 0 &&
-    boxHeight(face.box) > 0 &&
-    Math.max(spread(xs), spread(ys)) > LEAST_SPREAD
-  );
 }

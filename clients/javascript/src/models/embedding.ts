@@ -1,6 +1,6 @@
 /** Aligned crops → unit embeddings, by an ArcFace-like graph. */
 
-import { ModelError } from "./errors.js";
+import { ContractError } from "../errors.js";
 import type { RgbImage } from "./image.js";
 import { planes, type Graph } from "./runtime.js";
 
@@ -20,53 +20,35 @@ export interface Preprocessing {
 /** The version of the way from a photo to its crop that this package goes. */
 export const PREPROCESSING_VERSION = 2;
 
-/** An embedding graph with its preprocessing. */
-export class Embedder {
-  constructor(
-    private readonly graph: Graph,
-    readonly preprocessing: Preprocessing,
-  ) {}
-
-  /** Embed an aligned crop: n values of unit norm. */
-  async embed(crop: RgbImage): Promise<Float32Array> {
-    const { size, flip } = this.preprocessing;
-    if (crop.width !== size || crop.height !== size) {
-      throw new ModelError(`an aligned crop must have ${size} x ${size} pixels`);
-    }
-    const raw = await this.raw(crop);
-    if (flip) {
-      const other = await this.raw(mirrored(crop));
-      raw.forEach((value, i) => (raw[i] = value + other[i]));
-    }
-    const norm = Math.sqrt(raw.reduce((sum, value) => sum + value * value, 0));
-    if (!(norm > 0) || !Number.isFinite(norm)) {
-      throw new ModelError("the embedder's output for a crop is zero or not finite");
-    }
-    return raw.map((value) => value / norm);
+/** Embed an aligned crop of the preprocessing's size: n values of unit norm. */
+export async function embed(
+  graph: Graph,
+  crop: RgbImage,
+  preprocessing: Preprocessing,
+): Promise<Float32Array> {
+  const sum = await rawOutput(graph, crop, preprocessing);
+  if (preprocessing.flip) {
+    const other = await rawOutput(graph, mirrored(crop), preprocessing);
+    sum.forEach((value, i) => (sum[i] = value + other[i]));
   }
-
-  release(): Promise<void> {
-    return this.graph.release();
+  const norm = Math.sqrt(sum.reduce((total, value) => total + value * value, 0));
+  if (!(norm > 0) || !Number.isFinite(norm)) {
+    throw new ContractError("the embedder's output for a crop is zero or not finite");
   }
+  return sum.map((value) => value / norm);
+}
 
-  private async raw(crop: RgbImage): Promise<Float32Array> {
-    const { size, channel_order, mean, scale } = this.preprocessing;
-    const one = planes(
-      crop,
-      channel_order,
-      mean,
-      scale.map((value) => 1 / value),
-    );
-    // A graph with a fixed batch gets it filled up with zeros.
-    const batch = this.graph.inputShape[0] ?? 1;
-    const blob = new Float32Array(batch * one.length);
-    blob.set(one);
-    const [output] = (await this.graph.run(blob, [batch, 3, size, size])).values();
-    if (output?.dims.length !== 2 || output.dims[0] !== batch) {
-      throw new ModelError("the embedder must give one row of numbers for a crop");
-    }
-    return output.data.slice(0, output.dims[1]);
+async function rawOutput(graph: Graph, crop: RgbImage, how: Preprocessing): Promise<Float32Array> {
+  const one = planes(crop, how.channel_order, how.mean, how.scale.map((value) => 1 / value));
+  // A graph with a fixed batch gets it filled up with zeros.
+  const batch = graph.inputShape[0] ?? 1;
+  const blob = new Float32Array(batch * one.length);
+  blob.set(one);
+  const [output] = (await graph.run(blob, [batch, 3, crop.height, crop.width])).values();
+  if (output?.dims.length !== 2 || output.dims[0] !== batch) {
+    throw new ContractError("the embedder must give one row of numbers for a crop");
   }
+  return output.data.slice(0, output.dims[1]);
 }
 
 function mirrored(crop: RgbImage): RgbImage {
@@ -74,8 +56,7 @@ function mirrored(crop: RgbImage): RgbImage {
   for (let y = 0; y < crop.height; y++) {
     for (let x = 0; x < crop.width; x++) {
       const from = 3 * (y * crop.width + x);
-      const to = 3 * (y * crop.width + crop.width - 1 - x);
-      data.set(crop.data.subarray(from, from + 3), to);
+      data.set(crop.data.subarray(from, from + 3), 3 * (y * crop.width + crop.width - 1 - x));
     }
   }
   return { ...crop, data };

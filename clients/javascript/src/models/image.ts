@@ -1,6 +1,6 @@
 /** Pictures as arrays, and the three ways in which they are resampled, as OpenCV does it. */
 
-import { ImageError } from "./errors.js";
+import { PhotoError } from "../errors.js";
 
 /** A picture: RGB, 8 bits a channel, row by row from the top. */
 export interface RgbImage {
@@ -27,8 +27,7 @@ export function fromImageData(pixels: {
   readonly width: number;
   readonly height: number;
 }): RgbImage {
-  const count = pixels.width * pixels.height;
-  const data = new Uint8Array(3 * count);
+  const data = new Uint8Array(3 * pixels.width * pixels.height);
   for (let from = 0, to = 0; to < data.length; from += 4, to += 3) {
     data[to] = pixels.data[from];
     data[to + 1] = pixels.data[from + 1];
@@ -40,15 +39,16 @@ export function fromImageData(pixels: {
 /**
  * Decode a photo in a browser, upright: the EXIF orientation is applied.
  *
- * Colours stay as they are in the file, as the service reads them. Throws `ImageError` of a
- * file that is no picture.
+ * Colours stay as they are in the file, as the service reads them. Throws `PhotoError`
+ * `unsupported_image` of a file that is no picture.
  */
 export async function decodeImage(photo: Blob): Promise<RgbImage> {
   const bitmap = await createImageBitmap(photo, {
     imageOrientation: "from-image",
     colorSpaceConversion: "none",
   }).catch(() => {
-    throw new ImageError();
+    const message = "The file is not a picture that this browser reads; send a JPEG or PNG.";
+    throw new PhotoError("unsupported_image", message);
   });
   try {
     const canvas = new OffscreenCanvas(bitmap.width, bitmap.height);
@@ -61,123 +61,77 @@ export async function decodeImage(photo: Blob): Promise<RgbImage> {
   }
 }
 
-// OpenCV's bilinear weights are whole multiples of 1/2048.
-const WEIGHT_BITS = 11;
-
+/** What one pixel of the result takes along one side: weights of pixels from `start` on. */
 interface Taps {
-  readonly first: Int32Array;
-  readonly second: Int32Array;
-  readonly weights: Int32Array;
+  readonly start: number;
+  readonly weights: readonly number[];
 }
 
-function linearTaps(from: number, to: number): Taps {
-  const first = new Int32Array(to);
-  const second = new Int32Array(to);
-  const weights = new Int32Array(2 * to);
+/** The two nearest pixels, by the distance of their centres. */
+function linearTaps(from: number, to: number): Taps[] {
+  return Array.from({ length: to }, (_, i) => {
+    const at = ((i + 0.5) * from) / to - 0.5;
+    const start = Math.floor(at);
+    if (start < 0) return { start: 0, weights: [1] };
+    if (start >= from - 1) return { start: from - 1, weights: [1] };
+    return { start, weights: [start + 1 - at, at - start] };
+  });
+}
+
+/** All pixels that the pixel of the result covers, by the share of it that each has. */
+function areaTaps(from: number, to: number): Taps[] {
   const scale = from / to;
-  for (let i = 0; i < to; i++) {
-    const at = Math.fround((i + 0.5) * scale - 0.5);
-    let low = Math.floor(at);
-    let share = Math.fround(at - low);
-    if (low < 0) [low, share] = [0, 0];
-    if (low >= from - 1) [low, share] = [from - 1, 0];
-    first[i] = low;
-    second[i] = Math.min(low + 1, from - 1);
-    weights[2 * i] = roundHalfEven(Math.fround(1 - share) * (1 << WEIGHT_BITS));
-    weights[2 * i + 1] = roundHalfEven(share * (1 << WEIGHT_BITS));
-  }
-  return { first, second, weights };
-}
-
-/** Resize bilinearly, in the fixed-point arithmetic of `cv2.resize` with `INTER_LINEAR`. */
-export function resizeLinear(image: RgbImage, width: number, height: number): RgbImage {
-  if (width === image.width && height === image.height) return image;
-  // OpenCV halves by areas.
-  if (2 * width === image.width && 2 * height === image.height) {
-    return resizeArea(image, width, height);
-  }
-  const columns = linearTaps(image.width, width);
-  const rows = linearTaps(image.height, height);
-  const out = new Uint8Array(3 * width * height);
-  // Rows of the source, resized along x and kept for the next row of the result.
-  const kept = [new Int32Array(3 * width), new Int32Array(3 * width)];
-  const keptAt = [-1, -1];
-  const resized = (row: number, other: number): Int32Array => {
-    const known = keptAt.indexOf(row);
-    if (known >= 0) return kept[known];
-    const place = keptAt[0] === other ? 1 : 0;
-    const line = kept[place];
-    const start = 3 * row * image.width;
-    for (let x = 0; x < width; x++) {
-      const a = start + 3 * columns.first[x];
-      const b = start + 3 * columns.second[x];
-      const left = columns.weights[2 * x];
-      const right = columns.weights[2 * x + 1];
-      for (let c = 0; c < 3; c++) {
-        line[3 * x + c] = image.data[a + c] * left + image.data[b + c] * right;
-      }
-    }
-    keptAt[place] = row;
-    return line;
-  };
-  for (let y = 0; y < height; y++) {
-    const above = resized(rows.first[y], rows.second[y]);
-    const below = resized(rows.second[y], rows.first[y]);
-    const upper = rows.weights[2 * y];
-    const lower = rows.weights[2 * y + 1];
-    const start = 3 * y * width;
-    for (let i = 0; i < above.length; i++) {
-      const sum = ((upper * (above[i] >> 4)) >> 16) + ((lower * (below[i] >> 4)) >> 16);
-      out[start + i] = (sum + 2) >> 2;
-    }
-  }
-  return { data: out, width, height };
-}
-
-/** Share that each source pixel has in the result: runs of weights, one after the other. */
-function areaTaps(from: number, to: number): { start: Int32Array; weights: number[][] } {
-  const start = new Int32Array(to);
-  const weights: number[][] = [];
-  const scale = from / to;
-  for (let i = 0; i < to; i++) {
+  return Array.from({ length: to }, (_, i) => {
     const [low, high] = [i * scale, Math.min((i + 1) * scale, from)];
-    start[i] = Math.floor(low);
-    const run: number[] = [];
-    for (let j = start[i]; j < high && j < from; j++) {
-      run.push(Math.min(high, j + 1) - Math.max(low, j));
+    const start = Math.floor(low);
+    const weights: number[] = [];
+    for (let j = start; j < high; j++) {
+      weights.push((Math.min(high, j + 1) - Math.max(low, j)) / (high - low));
     }
-    const total = run.reduce((sum, share) => sum + share, 0);
-    weights.push(run.map((share) => share / total));
-  }
-  return { start, weights };
+    return { start, weights };
+  });
 }
+
+function resize(
+  image: RgbImage,
+  width: number,
+  height: number,
+  taps: typeof linearTaps,
+  rounding: number,
+): RgbImage {
+  if (width === image.width && height === image.height) return image;
+  const columns = taps(image.width, width);
+  const data = new Uint8Array(3 * width * height);
+  const line = new Float64Array(3 * image.width);
+  taps(image.height, height).forEach(({ start: top, weights }, y) => {
+    line.fill(0);
+    weights.forEach((weight, j) => {
+      const row = image.data.subarray(3 * (top + j) * image.width);
+      for (let i = 0; i < line.length; i++) line[i] += weight * row[i];
+    });
+    columns.forEach(({ start: left, weights: shares }, x) => {
+      for (let channel = 0; channel < 3; channel++) {
+        let sum = 0;
+        for (let j = 0; j < shares.length; j++) sum += shares[j] * line[3 * (left + j) + channel];
+        // Sums of shares may miss a half by an ulp; OpenCV adds whole numbers.
+        data[3 * (y * width + x) + channel] = Math.floor(sum + rounding + 1e-9);
+      }
+    });
+  });
+  return { data, width, height };
+}
+
+/** Resize bilinearly, as `cv2.resize` with `INTER_LINEAR`. */
+export const resizeLinear = (image: RgbImage, width: number, height: number): RgbImage => {
+  // OpenCV halves by areas. Else its fixed point cuts two summands to quarters, which loses a quarter
+  // on average, and rounds their sum half up, which gains an eighth.
+  const isHalf = 2 * width === image.width && 2 * height === image.height;
+  return isHalf ? resizeArea(image, width, height) : resize(image, width, height, linearTaps, 0.375);
+};
 
 /** Shrink to the mean of the area that each pixel covers, as `cv2.resize` with `INTER_AREA`. */
-export function resizeArea(image: RgbImage, width: number, height: number): RgbImage {
-  if (width === image.width && height === image.height) return image;
-  const columns = areaTaps(image.width, width);
-  const rows = areaTaps(image.height, height);
-  const out = new Uint8Array(3 * width * height);
-  const sums = new Float64Array(3 * image.width);
-  for (let y = 0; y < height; y++) {
-    sums.fill(0);
-    rows.weights[y].forEach((share, j) => {
-      const start = 3 * (rows.start[y] + j) * image.width;
-      for (let i = 0; i < sums.length; i++) sums[i] += share * image.data[start + i];
-    });
-    for (let x = 0; x < width; x++) {
-      for (let c = 0; c < 3; c++) {
-        let sum = 0;
-        columns.weights[x].forEach((share, j) => {
-          sum += share * sums[3 * (columns.start[x] + j) + c];
-        });
-        // The sum of shares may miss a half by an ulp; OpenCV adds whole numbers.
-        out[3 * (y * width + x) + c] = Math.floor(sum + 0.5 + 1e-9);
-      }
-    }
-  }
-  return { data: out, width, height };
-}
+export const resizeArea = (image: RgbImage, width: number, height: number): RgbImage =>
+  resize(image, width, height, areaTaps, 0.5);
 
 /**
  * Warp bilinearly into a square, 0 outside of the picture, as `cv2.warpAffine`.
@@ -205,7 +159,7 @@ export function warpAffine(image: RgbImage, matrix: Affine, size: number): RgbIm
       for (let k = 0; k < 3; k++) {
         const above = value(left, top, k) * (1 - fx) + value(left + 1, top, k) * fx;
         const below = value(left, top + 1, k) * (1 - fx) + value(left + 1, top + 1, k) * fx;
-        out[3 * (v * size + u) + k] = roundHalfEven(above * (1 - fy) + below * fy);
+        out[3 * (v * size + u) + k] = Math.round(above * (1 - fy) + below * fy);
       }
     }
   }
@@ -228,7 +182,7 @@ export function placed(
   return { data, width, height };
 }
 
-/** Round to the nearest whole number, halves to the even one, as Python and OpenCV do. */
+/** Round to the nearest whole number, halves to the even one, as Python does sizes. */
 export function roundHalfEven(value: number): number {
   const low = Math.floor(value);
   const share = value - low;

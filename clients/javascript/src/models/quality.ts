@@ -1,8 +1,8 @@
 /** Is this face good enough to enroll or to verify? Measures, limits, and named refusals. */
 
+import { PhotoError } from "../errors.js";
 import { similarityTransform, template } from "./alignment.js";
-import { boxHeight, boxWidth, shorterSide, type Face, type Point } from "./boxes.js";
-import { FaceTooSmall, LowQuality, type Measured } from "./errors.js";
+import { boxHeight, boxWidth, shorterSide, type Face, type Point } from "./faces.js";
 import { resizeArea, type RgbImage } from "./image.js";
 
 // As in `models/quality.py`, where the reason for each number stands.
@@ -37,34 +37,18 @@ export interface Quality {
   readonly aspect: number | null;
 }
 
-/** What a face must reach: the names are those of {@link Quality}. */
-export interface QualityLimits {
-  /** Undefined takes the detector's own recommendation. */
-  readonly min_score?: number;
-  readonly min_face_size: number;
-  readonly min_sharpness: number;
-  readonly min_brightness: number;
-  readonly max_brightness: number;
-  readonly min_exposure: number;
-  readonly max_yaw: number;
-  readonly max_pitch: number;
-  readonly max_roll: number;
-  readonly min_border: number;
-  readonly max_aspect: number;
-}
-
-export const DEFAULT_QUALITY: QualityLimits = {
-  min_face_size: 24,
-  min_sharpness: 0.5,
-  min_brightness: 6,
-  max_brightness: 235,
-  min_exposure: 40,
-  max_yaw: 70,
-  max_pitch: 55,
-  max_roll: 45,
-  min_border: 0.08,
-  max_aspect: 1.7,
-};
+/** What a face must reach, by what is measured. */
+export const QUALITY_LIMITS = {
+  face_size: 24,
+  sharpness: 0.5,
+  brightness: [6, 235],
+  exposure: 40,
+  yaw: 70,
+  pitch: 55,
+  roll: 45,
+  border: 0.08,
+  aspect: 1.7,
+} as const;
 
 /** Measure the aligned crop of a face in `image`; `face` is undefined for crops that came aligned. */
 export function measure(crop: RgbImage, face: Face | undefined, image: RgbImage): Quality {
@@ -110,14 +94,8 @@ function measureBorder(keypoints: readonly Point[], image: RgbImage): number {
 
 /** Luma, 112 x 112. */
 function greyCrop(crop: RgbImage): Float64Array {
-  const grey = new Uint8Array(crop.width * crop.height);
-  for (let i = 0; i < grey.length; i++) {
-    grey[i] = luma(crop.data, 3 * i);
-  }
-  if (crop.width === SIDE) return Float64Array.from(grey);
-  const tripled = new Uint8Array(3 * grey.length).map((_, i) => grey[Math.floor(i / 3)]);
-  const small = resizeArea({ ...crop, data: tripled }, SIDE, SIDE);
-  return Float64Array.from({ length: SIDE * SIDE }, (_, i) => small.data[3 * i]);
+  const { data } = resizeArea(crop, SIDE, SIDE);
+  return Float64Array.from({ length: SIDE * SIDE }, (_, i) => luma(data, 3 * i));
 }
 
 /**
@@ -210,61 +188,53 @@ const REMEDIES: Readonly<Record<string, string>> = {
 };
 
 /**
- * Refuse a face that fails a limit, by `FaceTooSmall` or by `LowQuality`, which names every one.
+ * Refuse a face that fails a limit, by `face_too_small` or by `low_quality`, which names every one.
  *
- * @param recommendedScore what `min_score` is where the limits leave it open.
+ * @param leastScore confidence that the detector recommends.
  */
-export function check(quality: Quality, limits: QualityLimits, recommendedScore: number): void {
+export function requireQuality(quality: Quality, leastScore: number): void {
+  const limits = QUALITY_LIMITS;
   const size = quality.face_size;
-  if (size !== null && size < limits.min_face_size) {
-    throw new FaceTooSmall(
-      `The face is ${size.toFixed(0)} pixels wide; at least ${limits.min_face_size} are needed. ` +
+  if (size !== null && size < limits.face_size) {
+    throw new PhotoError(
+      "face_too_small",
+      `The face is ${size.toFixed(0)} pixels wide; at least ${limits.face_size} are needed. ` +
         "Come closer or send a larger photo.",
-      { size: measured(size, limits.min_face_size) },
+      { size: measured(size, limits.face_size) },
     );
   }
-  const minScore = limits.min_score ?? recommendedScore;
-  const failed: Record<string, Measured | Record<string, Measured>> = {};
-  if (quality.score !== null && quality.score < minScore) {
-    failed["score"] = measured(quality.score, minScore);
+  const { score, sharpness, brightness, exposure, yaw, pitch, roll, border, aspect } = quality;
+  const below = (value: number | null, limit: number): boolean => value !== null && value < limit;
+  const beyond = (value: number | null, limit: number): boolean =>
+    value !== null && Math.abs(value) > limit;
+  const [darkest, brightest] = limits.brightness;
+  const checks: readonly [string, string | null, number | null, number, boolean][] = [
+    ["score", null, score, leastScore, below(score, leastScore)],
+    ["blur", null, sharpness, limits.sharpness, below(sharpness, limits.sharpness)],
+    ["darkness", null, exposure, limits.exposure, below(exposure, limits.exposure)],
+    ["darkness", null, brightness, darkest, below(brightness, darkest)],
+    ["brightness", null, brightness, brightest, beyond(brightness, brightest)],
+    ["turned", null, roll, limits.roll, beyond(roll, limits.roll)],
+    ["pose", "yaw", yaw, limits.yaw, beyond(yaw, limits.yaw)],
+    ["pose", "pitch", pitch, limits.pitch, beyond(pitch, limits.pitch)],
+    ["hidden", "border", border, limits.border, below(border, limits.border)],
+    ["hidden", "aspect", aspect, limits.aspect, beyond(aspect, limits.aspect)],
+  ];
+  const failed: Record<string, object> = {};
+  for (const [what, part, value, limit, fails] of checks) {
+    if (!fails) continue;
+    const seen = measured(value ?? 0, limit);
+    if (part !== null) failed[what] = { ...failed[what], [part]: seen };
+    else failed[what] ??= seen;
   }
-  if (quality.sharpness < limits.min_sharpness) {
-    failed["blur"] = measured(quality.sharpness, limits.min_sharpness);
-  }
-  if (quality.exposure < limits.min_exposure) {
-    failed["darkness"] = measured(quality.exposure, limits.min_exposure);
-  } else if (quality.brightness < limits.min_brightness) {
-    failed["darkness"] = measured(quality.brightness, limits.min_brightness);
-  }
-  if (quality.brightness > limits.max_brightness) {
-    failed["brightness"] = measured(quality.brightness, limits.max_brightness);
-  }
-  if (quality.roll !== null && Math.abs(quality.roll) > limits.max_roll) {
-    failed["turned"] = measured(quality.roll, limits.max_roll);
-  }
-  const pose: Record<string, Measured> = {};
-  for (const name of ["yaw", "pitch"] as const) {
-    const angle = quality[name];
-    const limit = limits[`max_${name}`];
-    if (angle !== null && Math.abs(angle) > limit) pose[name] = measured(angle, limit);
-  }
-  if (Object.keys(pose).length > 0) failed["pose"] = pose;
-  const hidden: Record<string, Measured> = {};
-  if (quality.border !== null && quality.border < limits.min_border) {
-    hidden["border"] = measured(quality.border, limits.min_border);
-  }
-  if (quality.aspect !== null && quality.aspect > limits.max_aspect) {
-    hidden["aspect"] = measured(quality.aspect, limits.max_aspect);
-  }
-  if (Object.keys(hidden).length > 0) failed["hidden"] = hidden;
   const names = Object.keys(failed);
-  if (names.length > 0) {
-    const remedies = names.map((name) => REMEDIES[name]).join(" ");
-    throw new LowQuality(`The photo is not good enough (${names.join(", ")}). ${remedies}`, failed);
-  }
+  if (names.length === 0) return;
+  const remedies = names.map((name) => REMEDIES[name]).join(" ");
+  const message = `The photo is not good enough (${names.join(", ")}). ${remedies}`;
+  throw new PhotoError("low_quality", message, failed);
 }
 
-const measured = (value: number, limit: number): Measured => ({
+const measured = (value: number, limit: number): { value: number; limit: number } => ({
   value: Math.round(value * 1000) / 1000,
   limit,
 });

@@ -1,6 +1,6 @@
 /** What is used of ONNX Runtime: the caller gives its module, so that this package bundles none. */
 
-import { PackError } from "./errors.js";
+import { ContractError } from "../errors.js";
 
 /** The module `onnxruntime-web` or `onnxruntime-node`. */
 export interface Runtime {
@@ -41,18 +41,18 @@ export class Graph {
     readonly inputShape: readonly (number | undefined)[],
   ) {}
 
-  /** Load a graph; throws `PackError` where it is none, or has another input than one image. */
+  /** Load a graph; throws `ContractError` where it is none, or has another input than one image. */
   static async load(runtime: Runtime, bytes: Uint8Array, options?: object): Promise<Graph> {
     let session: RuntimeSession;
     try {
       session = await runtime.InferenceSession.create(bytes, { ...ERRORS_ONLY, ...options });
     } catch (error) {
-      throw new PackError(`ONNX Runtime does not load a graph of the pack: ${String(error)}`);
+      throw new ContractError(`ONNX Runtime does not load a graph of the pack: ${String(error)}`);
     }
     const input = session.inputMetadata?.[0] as { shape?: readonly unknown[] } | undefined;
     if (session.inputNames.length !== 1 || input?.shape?.length !== 4) {
       await session.release();
-      throw new PackError("a graph of the pack has not one image input, or ONNX Runtime is too old");
+      throw new ContractError("a graph of the pack has not one image input, or ONNX Runtime is too old");
     }
     const shape = input.shape.map((size) =>
       typeof size === "number" && size > 0 ? size : undefined,
@@ -71,7 +71,7 @@ export class Graph {
     try {
       outputs = await this.session.run({ [this.session.inputNames[0]]: input }, ERRORS_ONLY);
     } catch (error) {
-      throw new PackError(`ONNX Runtime does not run a graph of the pack: ${String(error)}`);
+      throw new ContractError(`ONNX Runtime does not run a graph of the pack: ${String(error)}`);
     }
     return new Map(this.outputNames.map((name) => [name, outputs[name] as Tensor]));
   }

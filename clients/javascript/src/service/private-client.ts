@@ -1,33 +1,26 @@
 /** The client that never sends a face: it embeds and lifts here, and sends private templates. */
 
-import { VeilfaceError } from "../errors.js";
-import { ModelError } from "../models/errors.js";
+import type { Decision, Enrollment } from "../answers.js";
+import { base64, concealed } from "../bytes.js";
+import { PhotoError, UnexpectedAnswer, VeilfaceError } from "../errors.js";
+import type { FacePolicy } from "../models/faces.js";
 import { decodeImage, type RgbImage } from "../models/image.js";
 import { ModelPack, type PackGraphs, type PhotoCheck } from "../models/pack.js";
-import type { FacePolicy } from "../models/selection.js";
 import type { Runtime } from "../models/runtime.js";
 import { liftTemplate, requireContract, type PublicContract } from "../templates/contract.js";
 import { DecoyGenerator } from "../templates/generator.js";
-import type { Decision, Enrollment } from "./answers.js";
-import { base64 } from "./base64.js";
 import {
   ENROLL_PHOTOS,
-  fields,
-  precondition,
+  given,
+  keyField,
   PROBE_PHOTOS,
-  readDecision,
-  readEnrollment,
   requirePhotos,
   Session,
   subjectPath,
-  type ClientOptions,
   type EnrollOptions,
   type VerifyOptions,
 } from "./client.js";
-import { ContractMismatch, UnexpectedAnswer } from "./errors.js";
-import { holderKeyField } from "./holder-keys.js";
-import { Enrollable, Probe } from "./lifts.js";
-import { LiftInputs, SharedInputs } from "./lift-inputs.js";
+import type { ClientOptions } from "./sending.js";
 
 const LOOKS = 3;
 
@@ -46,16 +39,66 @@ export interface PrivateOptions extends ClientOptions {
   readonly dim?: number;
 }
 
+/** What a client has lifted: a template that enrolls, or a probe; no photo, and no embedding. */
+export class Lift {
+  constructor(
+    /** A probe is sent once for each attempt that it is meant for. */
+    readonly kind: "enrollment" | "probe",
+    readonly contractId: string,
+    /** The wire bytes. Printing the lift does not show them. */
+    readonly template: Uint8Array,
+  ) {
+    concealed(this, "template");
+  }
+}
+
+/** What one contract lifts with. It is freed once it was retired and no lift uses it any more. */
+export class Lifter {
+  #uses = 0;
+  #isRetired = false;
+
+  constructor(
+    readonly contract: PublicContract,
+    readonly generator: DecoyGenerator,
+    readonly pack: ModelPack,
+  ) {}
+
+  get isRetired(): boolean {
+    return this.#isRetired;
+  }
+
+  async use<T>(work: (lifter: Lifter) => Promise<T>): Promise<T> {
+    this.#uses++;
+    try {
+      return await work(this);
+    } finally {
+      this.#uses--;
+      await this.#freeIfUnused();
+    }
+  }
+
+  async retire(): Promise<void> {
+    if (this.#isRetired) return;
+    this.#isRetired = true;
+    await this.#freeIfUnused();
+  }
+
+  async #freeIfUnused(): Promise<void> {
+    if (this.#isRetired && this.#uses === 0) await this.pack.release();
+  }
+}
+
 /** Embeds and lifts here, and sends private templates only. Rights: `embeddings` beside the call's. */
 export class PrivateClient extends Session {
   readonly #options: PrivateOptions;
-  #shared: SharedInputs;
-  #closed = false;
+  // One for this client and those that `as` made of it.
+  #shared: { clients: number; lifter: Promise<Lifter> | undefined };
+  #isClosed = false;
 
   constructor(url: string, bearer: string, options: PrivateOptions) {
     super(url, bearer, options);
     this.#options = options;
-    this.#shared = new SharedInputs();
+    this.#shared = { clients: 1, lifter: undefined };
   }
 
   /**
@@ -66,7 +109,8 @@ export class PrivateClient extends Session {
   as(bearer: string): PrivateClient {
     this.#requireOpen();
     const other = new PrivateClient(this.url, bearer, this.#options);
-    other.#shared = this.#shared.join();
+    other.#shared = this.#shared;
+    this.#shared.clients++;
     return other;
   }
 
@@ -77,16 +121,13 @@ export class PrivateClient extends Session {
 
   /** Whether a photo would do, for guidance before a camera; nothing is embedded or sent of it. */
   async check(photo: Photo, { face }: { face?: FacePolicy } = {}): Promise<PhotoCheck> {
-    return this.#with(async ({ pack }) => pack.checkPhoto(await imageOf(photo), { policy: face }));
+    return this.#with(async ({ pack }) => pack.checkPhoto(await imageOf(photo), face));
   }
 
   /** Lift a probe; nothing is sent of it. */
-  async lift(photos: readonly Photo[], { face }: { face?: FacePolicy } = {}): Promise<Probe> {
+  async lift(photos: readonly Photo[], { face }: { face?: FacePolicy } = {}): Promise<Lift> {
     requirePhotos(photos, PROBE_PHOTOS);
-    return this.#with(
-      async (inputs) =>
-        new Probe(await this.#lifted(inputs, photos, face, true), inputs.contract.contract_id),
-    );
+    return this.#lifted("probe", photos, face);
   }
 
   /**
@@ -94,15 +135,9 @@ export class PrivateClient extends Session {
    *
    * Never enroll the same photos twice: two lifts of them give the embedding away.
    */
-  async liftEnrollment(
-    photos: readonly Photo[],
-    { face }: { face?: FacePolicy } = {},
-  ): Promise<Enrollable> {
+  async liftEnrollment(photos: readonly Photo[], { face }: { face?: FacePolicy } = {}): Promise<Lift> {
     requirePhotos(photos, ENROLL_PHOTOS);
-    return this.#with(
-      async (inputs) =>
-        new Enrollable(await this.#lifted(inputs, photos, face, false), inputs.contract.contract_id),
-    );
+    return this.#lifted("enrollment", photos, face);
   }
 
   /**
@@ -112,53 +147,94 @@ export class PrivateClient extends Session {
    */
   async enroll(
     subject: string,
-    photos: readonly Photo[] | Enrollable,
+    photos: readonly Photo[] | Lift,
     options: EnrollOptions = {},
   ): Promise<Enrollment> {
     subjectPath(subject);
-    if (photos instanceof Enrollable) return this.#enroll(subject, photos, options);
-    return this.#withFreshContract(
-      () => this.liftEnrollment(photos, options),
-      (lift) => this.#enroll(subject, lift, options),
+    const { holderKey, replace } = options;
+    return this.#send(
+      photos instanceof Lift ? photos : () => this.liftEnrollment(photos, options),
+      (template) => this.putEnrollment(subject, replace, { template, ...keyField(holderKey) }),
     );
   }
 
   /** Lift photos here (or take a probe of {@link lift}), and verify by it alone. */
   async verify(
     subject: string,
-    photos: readonly Photo[] | Probe,
+    photos: readonly Photo[] | Lift,
     options: VerifyOptions = {},
   ): Promise<Decision> {
     subjectPath(subject);
-    if (photos instanceof Probe) return this.#verify(subject, photos, options);
-    return this.#withFreshContract(
-      () => this.lift(photos, options),
-      (lift) => this.#verify(subject, lift, options),
+    const { level, holderKey } = options;
+    return this.#send(
+      photos instanceof Lift ? photos : () => this.lift(photos, options),
+      (template) => this.postProbe(subject, given({ template, level, ...keyField(holderKey) })),
     );
   }
 
   /** Free what ONNX Runtime holds, where no other client and no lift needs it. */
   async close(): Promise<void> {
-    if (this.#closed) return;
-    this.#closed = true;
-    await this.#shared.leave();
+    if (this.#isClosed) return;
+    this.#isClosed = true;
+    if (--this.#shared.clients === 0) await this.#retire();
   }
 
   #requireOpen(): void {
-    if (this.#closed) throw new Error("this client was closed: make another one");
+    if (this.#isClosed) throw new Error("this client was closed: make another one");
   }
 
-  async #with<T>(use: (inputs: LiftInputs) => Promise<T>): Promise<T> {
-    this.#requireOpen();
-    const inputs = await this.#shared.taken(() => this.#fetched());
-    try {
-      return await use(inputs);
-    } finally {
-      await inputs.leave();
+  /** Send a lift, or what is lifted now; once more where its contract is no longer in force. */
+  async #send<T>(lifting: Lift | (() => Promise<Lift>), send: (template: string) => Promise<T>): Promise<T> {
+    let lift = lifting instanceof Lift ? lifting : await lifting();
+    for (let mayRepeat = !(lifting instanceof Lift); ; mayRepeat = false) {
+      try {
+        return await send(base64(lift.template));
+      } catch (error) {
+        if (!(error instanceof VeilfaceError)) throw error;
+        if (error.code !== "contract_mismatch") {
+          error.lift = lift;
+          throw error;
+        }
+        // The stored template may be the one of another contract: then lifting anew is no help.
+        if (!mayRepeat || !(await this.#isOutdated(lift))) throw error;
+        lift = await (lifting as () => Promise<Lift>)();
+      }
     }
   }
 
-  async #fetched(): Promise<LiftInputs> {
+  /** Whether another contract is in force than a lift's; then the next one is under that. */
+  async #isOutdated({ contractId }: Lift): Promise<boolean> {
+    const known = await this.#shared.lifter?.catch(() => undefined);
+    if (known?.contract.contract_id === contractId) await this.#retire();
+    return this.#with(async ({ contract }) => contract.contract_id !== contractId);
+  }
+
+  async #retire(): Promise<void> {
+    const { lifter } = this.#shared;
+    this.#shared.lifter = undefined;
+    // A preparation that failed holds nothing, and its error is that of its caller.
+    await (await lifter?.catch(() => undefined))?.retire();
+  }
+
+  async #with<T>(work: (lifter: Lifter) => Promise<T>): Promise<T> {
+    for (;;) {
+      this.#requireOpen();
+      const fetching = (this.#shared.lifter ??= this.#fetched());
+      try {
+        const lifter = await fetching;
+        // Another client may have met a newer contract meanwhile.
+        if (!lifter.isRetired) return await lifter.use(work);
+      } catch (error) {
+        // What failed to come is fetched again by the next lift.
+        if (this.#shared.lifter === fetching) {
+          await fetching.catch(() => (this.#shared.lifter = undefined));
+        }
+        throw error;
+      }
+    }
+  }
+
+  async #fetched(): Promise<Lifter> {
     for (let look = 0; look < LOOKS; look++) {
       const contract = await this.contract();
       const generator = await DecoyGenerator.fromBytes(await this.generator());
@@ -168,90 +244,27 @@ export class PrivateClient extends Session {
       const graphs = await (this.#options.graphs?.(contract) ?? this.pack());
       const { runtime, sessionOptions } = this.#options;
       const pack = await ModelPack.load(runtime, contract, graphs, sessionOptions);
-      return new LiftInputs(contract, generator, pack);
+      return new Lifter(contract, generator, pack);
     }
     throw new UnexpectedAnswer("the generator of the service is not that of its contract");
   }
 
-  async #lifted(
-    { contract, generator, pack }: LiftInputs,
-    photos: readonly Photo[],
-    face: FacePolicy | undefined,
-    probe: boolean,
-  ): Promise<Uint8Array> {
-    const embeddings: Float32Array[] = [];
-    for (const [index, photo] of photos.entries()) {
-      this.#options.signal?.throwIfAborted();
-      try {
-        const image = await imageOf(photo);
-        embeddings.push((await pack.embedPhoto(image, { policy: face })).embedding);
-      } catch (error) {
-        if (error instanceof ModelError) error.image = index;
-        throw error;
+  #lifted(kind: Lift["kind"], photos: readonly Photo[], face: FacePolicy | undefined): Promise<Lift> {
+    return this.#with(async ({ contract, generator, pack }) => {
+      const embeddings: Float32Array[] = [];
+      for (const [index, photo] of photos.entries()) {
+        this.sender.signal?.throwIfAborted();
+        try {
+          embeddings.push((await pack.embedPhoto(await imageOf(photo), face)).embedding);
+        } catch (error) {
+          if (error instanceof PhotoError) error.image = index;
+          throw error;
+        }
       }
-    }
-    return liftTemplate(contract, generator, embeddings, { probe, dim: this.#options.dim });
-  }
-
-  /** Lift and send; once more under the contract in force where it is another one by now. */
-  async #withFreshContract<L extends Enrollable | Probe, T>(
-    lift: () => Promise<L>,
-    send: (lift: L) => Promise<T>,
-  ): Promise<T> {
-    const first = await lift();
-    try {
-      return await send(first);
-    } catch (error) {
-      if (!(error instanceof ContractMismatch)) throw error;
-      await this.#shared.forget(first.contractId);
-      const inForce = await this.#with(async ({ contract }) => contract.contract_id);
-      // Else it is the subject's stored template that is of another contract.
-      if (inForce === first.contractId) throw error;
-    }
-    return send(await lift());
-  }
-
-  async #enroll(subject: string, lift: Enrollable, options: EnrollOptions): Promise<Enrollment> {
-    const { holderKey, replace } = options;
-    const headers = precondition(replace);
-    const template = base64(lift.template);
-    const body = fields({ template, ...holderKeyField(holderKey) });
-    const path = subjectPath(subject, "/enrollment");
-    return this.#naming(lift, () =>
-      this.send({
-        method: "PUT",
-        path,
-        headers,
-        body: () => body,
-        read: readEnrollment,
-        resend: this.resendOf(replace),
-      }),
-    );
-  }
-
-  async #verify(subject: string, lift: Probe, options: VerifyOptions): Promise<Decision> {
-    const { level, holderKey } = options;
-    const template = base64(lift.template);
-    const body = fields({ template, level, ...holderKeyField(holderKey) });
-    return this.#naming(lift, () =>
-      this.send({
-        method: "POST",
-        path: subjectPath(subject, "/verify"),
-        body: () => body,
-        read: readDecision,
-        resend: "when-not-done",
-      }),
-    );
-  }
-
-  /** The error that ends a lift's sending has it, so that callers can repeat it. */
-  async #naming<T>(lift: Enrollable | Probe, send: () => Promise<T>): Promise<T> {
-    try {
-      return await send();
-    } catch (error) {
-      if (error instanceof VeilfaceError && !(error instanceof ContractMismatch)) error.lift = lift;
-      throw error;
-    }
+      const options = { probe: kind === "probe", dim: this.#options.dim };
+      const template = liftTemplate(contract, generator, embeddings, options);
+      return new Lift(kind, contract.contract_id, template);
+    });
   }
 }
 

@@ -1,27 +1,27 @@
 /** What a client needs of a contract, and the lift that it describes. */
 
+import type { components } from "../openapi.js";
+import { sha256 } from "../bytes.js";
+import { ContractError } from "../errors.js";
 import type { PackContract } from "../models/pack.js";
-import { sha256 } from "../models/pack.js";
-import { meanEmbedding } from "./agreement.js";
-import { ContractError } from "./errors.js";
 import type { DecoyGenerator } from "./generator.js";
-import { lift, type Strategy } from "./lifting.js";
-import { encode } from "./wire.js";
+import { lift, meanEmbedding, type Strategy } from "./lifting.js";
+import { encode } from "./subspace.js";
 
-/** The answer of `GET /v1/contract`, as far as a client reads it. */
-export interface PublicContract extends PackContract {
-  readonly contract_id: string;
-  readonly binding: PackContract["binding"] & {
-    readonly strategy: Strategy;
-    readonly m: number;
-    readonly axes: number;
-    readonly decoy_source_id: string;
-    readonly rotation_version: string;
+/** The answer of `GET /v1/contract`, with what a client reads of its open members. */
+export type PublicContract = Omit<
+  components["schemas"]["ContractAnswer"],
+  "binding" | "recorded" | "calibrations"
+> &
+  PackContract & {
+    readonly binding: {
+      readonly strategy: Strategy;
+      readonly m: number;
+      readonly axes: number;
+      readonly decoy_source_id: string;
+    };
+    readonly calibrations: readonly { readonly mode: string; readonly probe_m: number }[];
   };
-  readonly calibrations: readonly { readonly mode: string; readonly probe_m: number }[];
-  readonly photo_consistency: number;
-  readonly probe_consistency: number;
-}
 
 /**
  * Refuse a contract that is not what its id hashes, and a generator other than the contract's or
@@ -46,40 +46,32 @@ export async function requireContract(
 }
 
 /**
- * The dimension of a lift: that of the contract for an enrollment, one that is calibrated for a
- * probe; without `dim` the largest of these.
+ * Average the embeddings of one person, lift them once, and encode the template's bytes.
+ *
+ * An enrollment has the contract's dimension; a probe `dim`, which must be calibrated, or without
+ * it the largest that is.
  */
-export function liftDimension(
-  contract: PublicContract,
-  { probe, dim }: { probe: boolean; dim?: number | undefined },
-): number {
-  if (!probe) return contract.binding.m;
-  const known = contract.calibrations
-    .filter(({ mode }) => mode === "s2s")
-    .map(({ probe_m }) => probe_m);
-  const chosen = dim ?? Math.max(...known);
-  if (!known.includes(chosen)) {
-    throw new ContractError(
-      known.length === 0
-        ? "the contract takes no lifted probes; calibrate it with --probe-dims"
-        : `the contract takes lifted probes of dimension ${known.join(", ")}, not ${chosen}`,
-    );
-  }
-  return chosen;
-}
-
-/** Average the embeddings of one person, lift them once, and encode the template's bytes. */
 export function liftTemplate(
   contract: PublicContract,
   generator: DecoyGenerator,
   embeddings: readonly Float32Array[],
-  options: { probe: boolean; dim?: number | undefined },
+  { probe, dim }: { probe: boolean; dim?: number | undefined },
 ): Uint8Array {
   const { binding, contract_id, photo_consistency, probe_consistency } = contract;
-  const m = liftDimension(contract, options);
-  const consistency = options.probe ? probe_consistency : photo_consistency;
-  const mean = meanEmbedding(embeddings, consistency);
+  const m = probe ? probeDimension(contract, dim) : binding.m;
+  const mean = meanEmbedding(embeddings, probe ? probe_consistency : photo_consistency);
   return encode(lift(mean, { strategy: binding.strategy, m, generator }), contract_id);
+}
+
+function probeDimension({ calibrations }: PublicContract, dim: number | undefined): number {
+  const known = calibrations.filter(({ mode }) => mode === "s2s").map(({ probe_m }) => probe_m);
+  const chosen = dim ?? Math.max(...known);
+  if (known.includes(chosen)) return chosen;
+  throw new ContractError(
+    known.length === 0
+      ? "the contract takes no lifted probes; calibrate it with --probe-dims"
+      : `the contract takes lifted probes of dimension ${known.join(", ")}, not ${chosen}`,
+  );
 }
 
 /** SHA-256 of the canonical JSON: sorted keys, no spaces. */

@@ -1,24 +1,16 @@
 /** Draw and lift for tests/clients/javascript/test_lifting.py. */
 
-import {
-  DecoyGenerator,
-  encode,
-  InconsistentImages,
-  lift,
-  liftTemplate,
-  meanEmbedding,
-  Randomness,
-  requireContract,
-  TemplateError,
-} from "../../dist/index.js";
+import { ContractError, DecoyGenerator, lift, liftTemplate, meanEmbedding, PhotoError, requireContract } from "../../dist/index.js";
+import { normal, uniform } from "../../dist/templates/samples.js";
+import { encode } from "../../dist/templates/subspace.js";
 import { bytes, input, output, text } from "./io.js";
 
 const floats = (encoded) => new Float32Array(bytes(encoded).buffer);
 
 const calls = {
   draws: ({ count }) => [
-    text(new Randomness().uniform(count, -1, 1)),
-    text(new Randomness().normal(count)),
+    text(uniform(count, -1, 1)),
+    text(normal(count)),
   ],
 
   async read({ generator }) {
@@ -32,7 +24,7 @@ const calls = {
 
   async decoys({ generator, count }) {
     const source = await DecoyGenerator.fromBytes(bytes(generator));
-    return text(Float32Array.from(source.draw(count, new Randomness()).flatMap((row) => [...row])));
+    return text(Float32Array.from(source.draw(count).flatMap((row) => [...row])));
   },
 
   async lift({ embedding, generator, strategy, m, contract_id }) {
@@ -58,10 +50,9 @@ async function answer({ call, ...given }) {
   try {
     return { value: await calls[call](given) };
   } catch (error) {
-    if (!(error instanceof TemplateError)) throw error;
-    const { name, message } = error;
-    if (!(error instanceof InconsistentImages)) return { error: name, message };
-    return { error: name, message, apart: error.apart, others: error.others };
+    if (!(error instanceof ContractError || error instanceof PhotoError)) throw error;
+    const { code, message, details } = error;
+    return { code, message, details };
   }
 }
 

@@ -3,26 +3,10 @@
  * as on the service's own page (docs/web-page.md "The holder key").
  */
 
-import { VeilfaceError } from "../errors.js";
+import { PasskeyError } from "../errors.js";
 
 // With another label every passkey would give another key.
 const LABEL = "Veilface holder key 1: ";
-
-/** Why there is no key from a passkey. */
-export class PasskeyError extends VeilfaceError {
-  override name = "PasskeyError";
-
-  /**
-   * @param code `passkey_refused` covers cancelled, too late and not there, which browsers do not
-   *   tell apart; `passkey_unsupported`: no WebAuthn, or no PRF extension.
-   */
-  constructor(
-    readonly code: "passkey_refused" | "passkey_unsupported" | "passkey_of_another",
-    message: string,
-  ) {
-    super(message);
-  }
-}
 
 /** A passkey that was just made; its key is asked for by {@link passkeyHolderKey}. */
 export interface Passkey {
@@ -94,27 +78,31 @@ export async function passkeyHolderKey(
   return new Uint8Array(await crypto.subtle.deriveBits(how, material, 256));
 }
 
-async function prompted(ask: () => Promise<Credential | null>): Promise<PublicKeyCredential> {
-  let given: Credential | null = null;
-  // In a page that is not isolated from others on its way, or of a number as a host, there are none.
-  if (!isSecureContext || /^[\d.]+$|:/.test(location.hostname)) {
-    throw new PasskeyError(
-      "passkey_unsupported",
-      "Passkeys need HTTPS or localhost, and an address with a host name.",
-    );
+/** Why this page cannot use passkeys, or undefined where it can. */
+export function whyNoPasskey(): string | undefined {
+  if (!isSecureContext) return "Browsers allow passkeys only over HTTPS or on localhost.";
+  if (/^[\d.]+$|:/.test(location.hostname)) {
+    return "Passkeys belong to a host name, not to an IP address: on this machine, open the page at localhost.";
   }
+  return globalThis.PublicKeyCredential ? undefined : "This browser has no passkeys.";
+}
+
+async function prompted(ask: () => Promise<Credential | null>): Promise<PublicKeyCredential> {
+  const why = whyNoPasskey();
+  if (why !== undefined) throw new PasskeyError("passkey_unsupported", why);
+  let used: Credential | null = null;
   try {
-    given = await ask();
+    used = await ask();
   } catch (error) {
     const { name } = error as Error;
     if (name === "AbortError") throw error;
     if (name !== "NotAllowedError") throw unsupported();
   }
-  if (given === null) {
+  if (used === null) {
     throw new PasskeyError(
       "passkey_refused",
       "No passkey was used: cancelled, timed out, or there is none here.",
     );
   }
-  return given as PublicKeyCredential;
+  return used as PublicKeyCredential;
 }

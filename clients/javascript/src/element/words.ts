@@ -1,0 +1,86 @@
+/** What `<veilface-login>` says to the person. */
+
+/** The texts of the element. */
+export interface Words {
+  readonly start: string;
+  readonly take: string;
+  readonly enroll: string;
+  readonly again: string;
+  /** While no face was looked for yet. */
+  readonly waiting: string;
+  /** A face is there that will do. */
+  readonly ready: string;
+  /** While the photos are taken. */
+  readonly hold: string;
+  readonly working: string;
+  readonly passkey: string;
+  readonly accept: string;
+  readonly reject: string;
+  readonly enrolled: string;
+  readonly camera: string;
+  /** What a screen reader calls the picture of the camera. */
+  readonly video: string;
+  /** Shown as long as verifications send photos, so before the camera starts. */
+  readonly frames: string;
+  /** By their names in a challenge, and `front` and `move_back`. */
+  readonly movements: Readonly<Record<string, string>>;
+  readonly notLive: string;
+  /** The service asks for liveness, and the page for none. */
+  readonly liveness: string;
+  /** What to do before the camera, by what keeps the face from being good enough. */
+  readonly hints: Readonly<Record<string, string>>;
+  /** By an error's `code`; the error's message for all others. */
+  readonly errors: Readonly<Record<string, string>>;
+}
+
+/** The texts in English; give others for another language. */
+export const WORDS: Words = {
+  start: "Start camera",
+  take: "Log in",
+  enroll: "Enroll",
+  again: "Try again",
+  waiting: "Look into the camera.",
+  ready: "Good. Hold still.",
+  hold: "Hold still …",
+  working: "One moment …",
+  passkey: "Use your passkey.",
+  accept: "Welcome.",
+  reject: "That did not match. Try again.",
+  enrolled: "You are enrolled.",
+  camera: "The camera cannot be used.",
+  video: "Your camera",
+  frames:
+    "To log in, move your head as you are asked to, for about 12 seconds. Photos of that are sent to the service.",
+  movements: {
+    front: "Look straight ahead.",
+    move_back: "Move back and look straight ahead.",
+    turn_left: "Turn your head to the left.",
+    turn_right: "Turn your head to the right.",
+    look_up: "Look up.",
+    look_down: "Look down.",
+    come_closer: "Come closer.",
+  },
+  notLive: "The movements were not seen. Follow each of them, in good light.",
+  liveness: "This service checks that a face is live, which takes photos. This page sends none.",
+  hints: {
+    no_face: "Bring your face into the outline.",
+    multiple_faces: "Come closer: there are several faces.",
+    face_too_small: "Come closer.",
+    score: "Show your whole face.",
+    blur: "Hold still.",
+    darkness: "Find more light.",
+    brightness: "Find softer light.",
+    turned: "Hold the camera upright.",
+    pose: "Look straight into the camera.",
+    hidden: "Show your whole face.",
+  },
+  errors: {},
+};
+
+/** Words with what is missing in English. */
+export const withDefaults = (given: Partial<Words>): Words => ({
+  ...WORDS,
+  ...given,
+  movements: { ...WORDS.movements, ...given.movements },
+  hints: { ...WORDS.hints, ...given.hints },
+});
