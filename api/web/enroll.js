@@ -1,5 +1,5 @@
 import { facts, h, openDialog, workbench } from "./dom.js";
-import { newHolderKey } from "./holder.js";
+import { holderKey } from "./holder.js";
 import { photoPicker } from "./photos.js";
 import { call, form, session, subjectPath } from "./service.js";
 import { SPELLING, offNote, subjectField, switchOf, whyOff } from "./subject.js";
@@ -16,7 +16,7 @@ export function enrollView(id) {
   const [subject, subjectPart] = subjectField(id, `A new id (${SPELLING}), or whom to enroll again.`);
   const result = h("div", { class: "result" });
   let dialog = null;
-  const holder = newHolderKey(subject, () => result.replaceChildren());
+  const holder = holderKey("enroll", subject, () => result.replaceChildren());
   const send = h("button", { type: "submit", disabled: true }, "Enroll");
   const say = (text) => (send.textContent = text);
   const picker = why

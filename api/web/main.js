@@ -3,7 +3,7 @@
 import { carriesFiles, h, takesFiles } from "./dom.js";
 import { enrollView } from "./enroll.js";
 import { peopleView } from "./people.js";
-import { serviceView } from "./panel.js";
+import { serviceView } from "./status.js";
 import { forgetKey, hasKey, learn, session, useKey } from "./service.js";
 import { verifyView } from "./verify.js";
 import { problemBox } from "./words.js";

@@ -5,9 +5,7 @@ import { bytes, h, newId, table } from "./dom.js";
 import { Problem, call, may, session, untilSignedOut } from "./service.js";
 import { lacking } from "./words.js";
 
-const CLIENT = "/assets/client/client.js";
 const RUNTIME = "/assets/client/ort.wasm.min.mjs";
-const BUILT = document.documentElement.dataset.private === "yes";
 // The graphs are fetched before anybody is named: their token is of a subject that nobody is.
 const NOBODY = "private-mode";
 const TRIES = 3;
@@ -23,22 +21,29 @@ export const STEPS = [
   "Only that set is sent, and stored, encrypted. Photos and embedding never leave this browser.",
 ];
 
-// One state for the tab.
+// One state for the tab, until sign-out.
 let on = true;
 // The switch of the view that is open.
 let current = null;
+// The client whose graphs are loaded or on their way.
 let prepared = null;
-// Until sign-out: two lifts of one embedding give it away. Lifts by action and photos, whatever they are
-// chosen by and in what order, and what each photo was lifted for.
-let kept = new Map();
-let used = new Map();
+// Two lifts of one embedding give it away: lifts by action and photos, and what each photo was lifted for.
+let lifts = new Map();
+let purposes = new Map();
 // What left the browser since that was last told: how often and how many bytes, by request and field.
 let left = new Map();
+
+// At sign-out: the next one to sign in begins anew.
+export function forget() {
+  on = true;
+  prepared = null;
+  [lifts, purposes, left] = [new Map(), new Map(), new Map()];
+}
 
 // Why private mode cannot serve this, or null.
 function whyNot(action, level) {
   const { contract, own } = session;
-  if (!BUILT) {
+  if (!session.client) {
     return "Private mode is not offered: this service was installed without the client that it needs (make javascript).";
   }
   if (!isSecureContext) return "Private mode needs HTTPS or localhost.";
@@ -95,7 +100,7 @@ export function offer(action, onchange) {
     if (told.textContent !== words) told.textContent = words;
   }
 
-  const check = h("p", { class: "check", hidden: !BUILT }, box, h("label", { for: box.id }, "Private mode"));
+  const check = h("p", { class: "check", hidden: !session.client }, box, h("label", { for: box.id }, "Private mode"));
   offered.root = h("div", { class: "private" }, check, told);
   current = offered;
   dropFailed();
@@ -104,36 +109,19 @@ export function offer(action, onchange) {
 
 export const active = () => on && current?.why === null;
 
-// Every call of the page, in private mode or not.
-export function note(method, target, body) {
-  const { pathname, searchParams } = new URL(target, location);
-  const request = `${method} ${pathname.replace(/([0-9a-f]{8})[0-9a-f]{56}/, "$1…")}`;
-  const sent = typeof body === "string" ? Object.entries(JSON.parse(body)) : [...(body ?? [])];
-  const fields = [...searchParams, ...sent];
-  for (const [field, value] of fields.length ? fields : [["no body", ""]]) {
-    const name = JSON.stringify([request, field]);
-    const row = left.get(name) ?? { request, field, times: 0, size: 0, photo: false };
-    left.set(name, row);
-    row.times += 1;
-    row.size += size(value);
-    row.photo ||= value instanceof Blob;
-  }
-}
-
-async function noted(url, options) {
-  note(options.method, url, options.body);
-  return fetch(url, options);
+// A view that is opened, or the switch, has it tried again; the looks of a camera do not.
+function dropFailed() {
+  if (prepared?.failed) prepared = null;
 }
 
 async function token(asked, signal) {
-  const body = JSON.stringify(asked);
-  return (await call("POST", "/v1/tokens", { body, signal, headers: { "Content-Type": "application/json" } })).token;
+  const headers = { "Content-Type": "application/json" };
+  return (await call("POST", "/v1/tokens", { body: JSON.stringify(asked), signal, headers })).token;
 }
 
-// The client whose graphs are loaded. One that failed is made anew for an attempt, and not for every look of a camera.
-function ready({ again = false } = {}) {
+function ready() {
   const until = untilSignedOut();
-  if (prepared?.until === until && !(again && prepared.failed)) return prepared.client;
+  if (prepared?.until === until) return prepared.client;
   const offered = current;
   offered.say(LOADING);
   const loading = { until, failed: false, client: load(until, offered.action) };
@@ -144,30 +132,20 @@ function ready({ again = false } = {}) {
   return loading.client;
 }
 
-// At sign-out: the next one to sign in begins anew.
-export function forget() {
-  on = true;
-  prepared = null;
-  kept = new Map();
-  used = new Map();
-  left = new Map();
-}
-
-// Whoever opens a view or switches has it tried again, the looks of a camera do not.
-function dropFailed() {
-  if (prepared?.failed) prepared = null;
-}
-
 async function load(signal, action) {
-  const [{ PrivateClient }, runtime] = await Promise.all([import(CLIENT), import(RUNTIME)]).catch(() => {
+  const runtime = await import(RUNTIME).catch(() => {
     throw new Problem({ code: "private_mode", message: "what private mode runs could not be loaded" });
   });
   // More need a page that is isolated.
   runtime.env.wasm.numThreads = 1;
+  const noted = (url, options) => {
+    note(options.method, url, options.body);
+    return fetch(url, options);
+  };
   for (let tries = 1; ; tries++) {
     signal.throwIfAborted();
     const bearer = await token({ subject_id: NOBODY, action }, signal);
-    const client = new PrivateClient(location.origin, bearer, { runtime, fetch: noted, signal });
+    const client = new session.client.PrivateClient(location.origin, bearer, { runtime, fetch: noted, signal });
     try {
       await client.prepare();
       signal.addEventListener("abort", () => void client.close());
@@ -180,30 +158,20 @@ async function load(signal, action) {
   }
 }
 
-// The errors of the client, as those of a call.
+// The errors of the client, as those of a call. What the page finds out by itself has the status that the
+// service would have given it.
 function problemOf(error, photos = 1) {
-  const { name, status, details = {}, image, requestId = null, retryAfter = null } = error;
-  // That of a DOMException is a number.
-  const code = typeof error.code === "string" ? error.code : null;
+  const { name, code, status, details, image, requestId = null, retryAfter = null } = error;
   if (error instanceof Problem || name === "AbortError") return error;
   const message = error.message.charAt(0).toLowerCase() + error.message.slice(1);
-  if (name === "ConnectionFailed") return new Problem({ code: "unreachable", message: "the service does not respond" });
-  if (status) {
-    const foreign = code.startsWith("http_");
-    return new Problem({
-      status,
-      code: foreign ? "unreachable" : code,
-      message: foreign ? `status ${status}, and not from this service` : message,
-      details,
-      requestId,
-      wait: retryAfter,
-    });
-  }
-  // What the page finds out by itself has the status that the service would have given it.
-  if (name === "PhotoError" || code === "lifted_before") {
+  if (name === "PhotoError") {
     const which = image !== undefined && photos > 1 ? `photo ${image + 1} of ${photos}: ` : "";
     return new Problem({ status: 422, code, message: which + message, details: { ...details, image } });
   }
+  if (name === "ConnectionFailed" || String(code).startsWith("http_")) {
+    return new Problem({ status, code: "unreachable", message: "the service does not respond" });
+  }
+  if (name === "ServiceError") return new Problem({ status, code, message, details, requestId, wait: retryAfter });
   return new Problem({ code: "private_mode", message: `private mode does not work here: ${message}` });
 }
 
@@ -223,39 +191,41 @@ async function nameOf(photo) {
   return String(new Uint8Array(hash));
 }
 
+// The lift of these photos for this action: made once, whatever they are chosen by and in what order.
 async function lifted(client, action, photos, face, until) {
   const names = await Promise.all(photos.map(nameOf));
   until.throwIfAborted();
-  const image = names.findIndex((name) => (used.get(name) ?? action) !== action);
+  const image = names.findIndex((name) => (purposes.get(name) ?? action) !== action);
   if (image >= 0) {
     const before = action === "verify" ? "to enroll" : "to verify";
     const message = `this photo was used ${before} already, and a second lift of it would give its embedding away`;
-    throw Object.assign(new Error(message), { code: "lifted_before", image });
+    throw new Problem({ status: 422, code: "lifted_before", message, details: { image } });
   }
   const all = JSON.stringify([action, ...[...new Set(names)].sort()]);
-  if (!kept.has(all)) {
+  if (!lifts.has(all)) {
     // Before it is waited for: another view may have the same photos meanwhile.
-    for (const name of names) used.set(name, action);
+    for (const name of names) purposes.set(name, action);
     const given = { face: face || undefined };
     const lift = action === "enroll" ? client.liftEnrollment(photos, given) : client.lift(photos, given);
-    kept.set(all, lift);
+    lifts.set(all, lift);
     lift.catch(() => {
-      if (until.aborted || kept.get(all) !== lift) return;
-      kept.delete(all);
-      const rest = new Set([...kept.keys()].flatMap((key) => JSON.parse(key)));
-      for (const name of names) if (!rest.has(name)) used.delete(name);
+      if (until.aborted || lifts.get(all) !== lift) return;
+      lifts.delete(all);
+      const rest = new Set([...lifts.keys()].flatMap((key) => JSON.parse(key)));
+      for (const name of names) if (!rest.has(name)) purposes.delete(name);
     });
   }
-  const lift = await kept.get(all);
+  const lift = await lifts.get(all);
   until.throwIfAborted();
   return lift;
 }
 
 async function attempt({ photos, face, ...asked }, send) {
   const until = untilSignedOut();
+  dropFailed();
   try {
     for (let first = true; ; first = false) {
-      const client = await ready({ again: true });
+      const client = await ready();
       until.throwIfAborted();
       const lift = await lifted(client, asked.action, photos, face, until);
       const one = client.as(await token(asked, until));
@@ -277,7 +247,7 @@ async function attempt({ photos, face, ...asked }, send) {
 async function contractChanged(client, lift, signal) {
   session.contract = await call("GET", "/v1/contract", { signal });
   if (session.contract.contract_id === lift.contractId) return false;
-  kept.clear();
+  lifts.clear();
   prepared = null;
   await client.close();
   current.at(current.level);
@@ -299,6 +269,22 @@ export const enroll = (name, { photos, face, holder_key }, replaces) =>
     return { ...answer, images: photos.map(() => ({ status: "lifted in this browser" })) };
   });
 
+// Count every call of the page, in private mode or not.
+export function note(method, target, body) {
+  const { pathname, searchParams } = new URL(target, location);
+  const request = `${method} ${pathname.replace(/([0-9a-f]{8})[0-9a-f]{56}/, "$1…")}`;
+  const sent = typeof body === "string" ? Object.entries(JSON.parse(body)) : [...(body ?? [])];
+  const fields = [...searchParams, ...sent];
+  for (const [field, value] of fields.length ? fields : [["no body", ""]]) {
+    const name = JSON.stringify([request, field]);
+    const row = left.get(name) ?? { request, field, times: 0, size: 0, photo: false };
+    left.set(name, row);
+    row.times += 1;
+    row.size += size(value);
+    row.photo ||= value instanceof Blob;
+  }
+}
+
 const size = (value) =>
   value instanceof Blob
     ? value.size
@@ -308,6 +294,9 @@ const size = (value) =>
 export function whatLeft() {
   const rows = [...left.values()];
   left = new Map();
+  const photos = rows.some(({ photo }) => photo)
+    ? "Photos were sent while private mode was off. "
+    : "No photo and no embedding was sent. ";
   return h(
     "section",
     { class: "card", "data-left": "" },
@@ -315,9 +304,7 @@ export function whatLeft() {
     h(
       "p",
       {},
-      rows.some(({ photo }) => photo)
-        ? "Photos were sent while private mode was off. "
-        : "No photo and no embedding was sent. ",
+      photos,
       "These are the calls since you signed in, or since this was last shown. ",
       "Beside these fields, they had their headers, with the API key or a token.",
     ),

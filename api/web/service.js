@@ -2,13 +2,16 @@
 // unticks it in this tab's session storage, which a browser may restore with the tab from its disk.
 
 const KEPT = "veilface-key";
+const CLIENT = "/assets/client/client.js";
 let key = kept((storage) => storage.getItem(KEPT)) ?? null;
 // Ends what still runs for a key that is forgotten.
 let running = new AbortController();
 
-// `mode` is the module of private mode, where the service serves its pack and the module could be loaded.
-export const session = { own: null, contract: null, mode: null, onrefused: () => {} };
-export const LIFTS = document.documentElement.dataset.private !== "no";
+const { dataset } = document.documentElement;
+// Whether the service serves its pack, so that this page may lift.
+export const LIFTS = dataset.private === "yes";
+// `client` is the JavaScript client where it was built, `mode` the module of private mode where it is there.
+export const session = { own: null, contract: null, client: null, mode: null, onrefused: () => {} };
 
 export const hasKey = () => key !== null;
 
@@ -65,7 +68,7 @@ export async function call(method, path, { body, headers, signal } = {}) {
     if (error.name === "AbortError") throw error;
     throw new Problem({ code: "unreachable", message: "the service does not respond" });
   }
-  if (answer.headers.get("X-Veilface-Notice")) document.documentElement.dataset.demo = "yes";
+  if (answer.headers.get("X-Veilface-Notice")) dataset.demo = "yes";
   const told = await answer.json().catch(() => null);
   ended.throwIfAborted();
   if (answer.ok && told) return told;
@@ -92,6 +95,7 @@ export function form(name, photos, fields = {}) {
 }
 
 export async function learn() {
+  if (dataset.client === "yes") session.client ??= await import(CLIENT).catch(() => null);
   if (LIFTS) session.mode ??= await import("./private.js").catch(() => null);
   [session.own, session.contract] = await Promise.all([
     call("GET", "/v1/key"),

@@ -80,7 +80,7 @@ export function verifyView(id) {
     say(moving() ? "Start head movements" : "Verify");
     send.disabled = !(picker.ready() || moving());
   }
-  const holder = holderKey(subject, clear);
+  const holder = holderKey("verify", subject, clear);
   subject.addEventListener("input", clear);
   level.addEventListener("change", showWhatIsAsked);
 

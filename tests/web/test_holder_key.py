@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import expect
 
+from tests.clients.javascript.conftest import require_client
 from tests.web.access import assert_accessible
 from tests.web.browser_tab import BrowserTab
 from tests.web.conftest import OpenTab
@@ -76,6 +77,8 @@ class Visitor:
 
 @pytest.fixture
 def visit(open_tab: OpenTab, local: Served) -> Callable[..., Visitor]:
+    require_client()
+
     def sign_in(token: str = "", **options: object) -> Visitor:
         tab = open_tab(local, sign_in=token, **options)
         console: list[str] = []
@@ -227,7 +230,7 @@ def test_an_ip_address_has_no_passkeys_but_key_files(
     page = tab.page
     tab.open("Enroll")
     expect(page.get_by_label(TO_PASSKEY)).to_be_disabled()
-    expect(page.get_by_text("Passkeys belong to a name")).to_be_visible()
+    expect(page.get_by_text("Passkeys belong to a host name")).to_be_visible()
     assert_accessible(tab, "enroll-no-passkeys")
     page.get_by_label("Person's id").fill(SUBJECT)
     choose(tab, PERSON, 1)

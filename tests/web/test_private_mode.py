@@ -400,7 +400,7 @@ def test_a_page_without_the_built_client_says_so(served: Served, open_tab: OpenT
         answer = route.fetch()
         route.fulfill(
             response=answer,
-            body=answer.text().replace('data-private="yes"', 'data-private="not-built"'),
+            body=answer.text().replace('data-client="yes"', 'data-client="no"'),
         )
 
     page.route(tab.url, not_built)

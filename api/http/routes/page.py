@@ -23,7 +23,7 @@ from models.synthetic import draw_face, encode_photo
 
 WEB = Path(__file__).resolve().parents[2] / "web"
 CLIENT = WEB / "client"
-"""What private mode runs in the browser, compressed; there after `make javascript`."""
+"""The JavaScript client and ONNX Runtime, compressed; there after `make javascript`."""
 TYPES = {
     ".html": "text/html; charset=utf-8",
     ".css": "text/css; charset=utf-8",
@@ -50,8 +50,6 @@ WITH_GRAPHS = {
         "script-src 'self'", "script-src 'self' 'wasm-unsafe-eval'"
     ),
 }
-DEMO_MARK = ('data-demo="no"', 'data-demo="yes"')
-PRIVATE_MARK = 'data-private="no"'
 
 FIRST_STRANGER = 101
 SHOTS = ENROLLED_PHOTOS + PROBE_PHOTOS
@@ -87,21 +85,18 @@ class Served:
 
 def page_routes(*, demo: bool, serve_pack: bool) -> list[BaseRoute]:
     """Return the routes of the page; those of the drawn people only with the demo model."""
+    # Not in the demo, whose model knows a cartoon face by a check that no graph holds.
+    lifts = serve_pack and not demo
+    client = _built_client(with_runtime=lifts)
     html = (WEB / "index.html").read_text(encoding="utf-8")
-    assets = {
+    for name, holds in (("demo", demo), ("client", bool(client)), ("private", lifts)):
+        html = html.replace(f'data-{name}="no"', f'data-{name}="{"yes" if holds else "no"}"')
+    headers = WITH_GRAPHS if client and lifts else HEADERS
+    assets = client | {
         path.name: Served.of(path.read_bytes(), path.suffix)
         for path in sorted(WEB.iterdir())
         if path.suffix in TYPES and path.name != "index.html"
     }
-    headers = HEADERS
-    if demo:
-        html = html.replace(*DEMO_MARK)
-    elif serve_pack:
-        # Not in the demo, whose model knows a cartoon face by a check that no graph holds.
-        client = _private_client()
-        assets |= client
-        headers = WITH_GRAPHS if client else HEADERS
-        html = html.replace(PRIVATE_MARK, f'data-private="{"yes" if client else "not-built"}"')
     index = Served.of(html.encode(), ".html")
 
     async def page(request: Request) -> Response:
@@ -122,9 +117,10 @@ def page_routes(*, demo: bool, serve_pack: bool) -> list[BaseRoute]:
     return routes
 
 
-def _private_client() -> dict[str, Served]:
-    """Return what private mode runs, by its names below ``/assets/``; nothing if not built."""
-    named = {path: Path(path.stem) for path in sorted(CLIENT.glob("*.gz"))}
+def _built_client(*, with_runtime: bool) -> dict[str, Served]:
+    """Return the client by its names below ``/assets/``; nothing where it was not built."""
+    pattern = "*.gz" if with_runtime else "client.js.gz"
+    named = {path: Path(path.stem) for path in sorted(CLIENT.glob(pattern))}
     return {
         f"{CLIENT.name}/{name}": Served.of(path.read_bytes(), name.suffix, "gzip")
         for path, name in named.items()

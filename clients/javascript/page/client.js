@@ -1,4 +1,4 @@
 // What the service's own page takes of this package.
-export { newHolderKey } from "../dist/service/client.js";
+export { base64url } from "../dist/bytes.js";
 export { createPasskey, passkeyHolderKey, whyNoPasskey } from "../dist/service/passkey.js";
 export { PrivateClient } from "../dist/service/private-client.js";

@@ -160,7 +160,7 @@ def test_the_page_takes_no_other_method(client: Client) -> None:
 
 
 def _serving_its_pack(folder: Path, **changes: Any) -> Client:
-    deployment = deploy(folder, serve_pack=True, **changes)
+    deployment = deploy(folder, **{"serve_pack": True, **changes})
     return Client(create_app(deployment.settings), headers=bearer(deployment.token))
 
 
@@ -179,7 +179,7 @@ def test_private_mode_is_offered_where_the_pack_is_served(
     _put_client(tmp_path / "client")
     monkeypatch.setattr(page, "CLIENT", tmp_path / "client")
     with _serving_its_pack(tmp_path / "served") as client:
-        assert 'data-private="yes"' in client.get("/").text
+        assert 'data-client="yes" data-private="yes"' in client.get("/").text
         assert policy_of(client) == POLICY | {"script-src": "'self' 'wasm-unsafe-eval'"}
         for name, kind, content in (
             ("client.js", "text/javascript; charset=utf-8", b"export const client = 1;"),
@@ -202,22 +202,23 @@ def test_without_the_built_client_the_page_is_told(
 ) -> None:
     monkeypatch.setattr(page, "CLIENT", tmp_path / "absent")
     with _serving_its_pack(tmp_path / "served") as client:
-        assert 'data-private="not-built"' in client.get("/").text
+        assert 'data-client="no" data-private="yes"' in client.get("/").text
         assert policy_of(client) == POLICY
         assert_error(client.get("/assets/client/client.js"), 404, "not_found")
 
 
-def test_private_mode_is_not_offered_elsewhere(
-    client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("changes", [{"serve_pack": False}, {"demo": True}])
+def test_elsewhere_the_page_has_the_client_for_its_passkeys_alone(
+    changes: dict[str, bool], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert 'data-private="no"' in client.get("/").text
+    """In the demo, what tells a cartoon face from another picture is in no graph."""
     _put_client(tmp_path / "client")
     monkeypatch.setattr(page, "CLIENT", tmp_path / "client")
-    # Nor in the demo: what tells a cartoon face from another picture is in no graph.
-    with _serving_its_pack(tmp_path / "demo", demo=True) as demo:
-        assert 'data-private="no"' in demo.get("/").text
-        assert policy_of(demo) == POLICY
-        assert_error(demo.get("/assets/client/client.js"), 404, "not_found")
+    with _serving_its_pack(tmp_path / "served", **changes) as client:
+        assert 'data-client="yes" data-private="no"' in client.get("/").text
+        assert policy_of(client) == POLICY
+        assert client.get("/assets/client/client.js").status_code == 200
+        assert_error(client.get("/assets/client/runtime.wasm"), 404, "not_found")
 
 
 def test_the_page_can_be_switched_off(tmp_path: Path) -> None:

@@ -1,6 +1,5 @@
 import { download, facts, h, oneIn, percent, table, when } from "./dom.js";
 import { call, session } from "./service.js";
-import { judged, thiefCard } from "./verdict.js";
 import { problemBox } from "./words.js";
 
 const RIGHTS = {
@@ -21,6 +20,26 @@ export function serviceView() {
     "section",
     {},
     h("h1", { tabindex: "-1" }, "Service"),
+    h(
+      "section",
+      { class: "card" },
+      h("h2", {}, "Verdict"),
+      h(
+        "p",
+        {},
+        "From the database alone a thief gets encrypted bytes, which open only with the master key. ",
+        contract.verdict
+          ? "What the strongest attack opened with the master key as well, and how accurate the service is:"
+          : h("strong", {}, "Nobody has measured what opens with the master key as well: veilface calibrate does."),
+      ),
+      h(
+        "div",
+        { class: "columns three" },
+        judged("Privacy: templates that a thief can open", contract.verdict?.privacy),
+        judged("Accuracy: people turned away wrongly", contract.verdict?.accuracy),
+        judged("Groups: strangers let in, in the worst group of people", contract.verdict?.groups),
+      ),
+    ),
     h(
       "div",
       { class: "columns" },
@@ -58,19 +77,6 @@ export function serviceView() {
             );
           }),
         ),
-      ),
-    ),
-    thiefCard(contract),
-    h(
-      "section",
-      { class: "card" },
-      h("h2", {}, "Verdict"),
-      h(
-        "div",
-        { class: "columns three" },
-        judged("Privacy: templates that a thief can open", contract.verdict?.privacy),
-        judged("Accuracy: people turned away wrongly", contract.verdict?.accuracy),
-        judged("Groups: strangers let in, in the worst group of people", contract.verdict?.groups),
       ),
     ),
     h(
@@ -119,6 +125,31 @@ export function serviceView() {
     ),
   );
   return { root, stop() {} };
+}
+
+// One judgement of the verdict: its figure, what was counted, and the limit.
+function judged(title, judgement) {
+  if (!judgement) return h("div", {}, h("h3", {}, title), h("p", {}, "Not measured."));
+  const { rate, value, limit, status, basis, shortfall } = judgement;
+  const group = basis.group ? `in ${basis.attribute} ${basis.group}, ` : "";
+  const passes = status === "PASS";
+  return h(
+    "div",
+    {},
+    h("h3", {}, title),
+    h(
+      "p",
+      { class: "figure" },
+      h("span", { class: "figure-number" }, percent(value)),
+      h("strong", { class: passes ? "ok" : "bad" }, passes ? "✓ PASS" : "✗ FAIL"),
+    ),
+    h(
+      "p",
+      { class: "hint" },
+      `${group}${rate.errors} of ${rate.trials.toLocaleString("en")}; at most ${percent(limit)} passes`,
+      shortfall ? `. Not enough to pass: ${shortfall}.` : ".",
+    ),
+  );
 }
 
 function counted(rate) {
