@@ -303,7 +303,7 @@ class Settings(BaseSettings):
     log_level: Literal["debug", "info", "warning", "error"] = Field(
         "info", description="Least severe log line that is written."
     )
-    web_page: bool = Field(True, description="Serve the web page at `/` (docs/web-page.md).")
+    web_page: bool = Field(True, description="Serve the web page at `/` (docs/javascript.md).")
     api_docs: bool = Field(
         True, description="Serve the reference of the API at `/docs`, for whoever reaches it."
     )

@@ -1,6 +1,6 @@
 /**
  * A holder key from a passkey, by WebAuthn's PRF extension: the same passkey gives the same key, here
- * as on the service's own page (docs/web-page.md "The holder key").
+ * as on the service's own page (docs/javascript.md "The holder key").
  */
 
 import { PasskeyError } from "../errors.js";
