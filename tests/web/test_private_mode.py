@@ -389,7 +389,7 @@ def test_a_key_without_embeddings_is_told_why(
         tab.page.get_by_role("link", name=view).first.click()
         expect(switch).to_be_disabled()
         expect(tab.page.locator(".private")).to_contain_text("“embeddings”")
-    assert all("/assets/client/" not in url for url in tab.requests)
+    assert all("/assets/client/ort" not in url for url in tab.requests)
 
 
 def test_a_page_without_the_built_client_says_so(served: Served, open_tab: OpenTab) -> None:
