@@ -38,10 +38,10 @@ class Detector(ABC):
 
     Parameters
     ----------
+    session
+        A graph with one image input.
     size
-        Side of the canvas, a multiple of 32.
-    fixed
-        Height and width where the graph accepts no other.
+        Side of the canvas, a multiple of 32, where the graph does not fix it.
     """
 
     kind: str
@@ -51,17 +51,12 @@ class Detector(ABC):
     clear_score: float
     """What nearly every upright face reaches that nothing covers, and no turned one does."""
 
-    def __init__(
-        self,
-        session: Session,
-        *,
-        input_name: str,
-        size: int = DEFAULT_SIZE,
-        fixed: Size | None = None,
-    ) -> None:
+    def __init__(self, session: Session, *, size: int = DEFAULT_SIZE) -> None:
         self._session = session
-        self._input_name = input_name
-        self.is_fixed = fixed is not None
+        self._input_name = session.inputs[0].name
+        height, width = session.inputs[0].shape[2:]
+        self.is_fixed = height is not None and width is not None
+        fixed = None if height is None or width is None else (height, width)
         self.sizes = canvas_sizes(size, fixed)
 
     def canvas(self, image: NDArray[np.uint8], size: Size) -> Size:  # noqa: ARG002 - of some kinds

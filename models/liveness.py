@@ -7,15 +7,19 @@ they cannot see is said in docs/liveness.md.
 import hashlib
 import json
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from models.errors import ModelError
+from models.errors import ModelError, PackError
+from models.pack_file import LivenessStatement, PackFile
+from models.pack_graphs import PackGraph, image_size
 from models.sessions import Session
 
 Box = tuple[float, float, float, float]
@@ -25,6 +29,9 @@ ScoreKind = Literal["softmax", "difference"]
 
 # A square is mirrored at this many times the input's resolution, or the frame's own.
 _FINER = 4
+# How far MiniFASNet's crop reaches is in no graph, but in the name that its authors give the file:
+# "2.7_80x80_MiniFASNetV2", "4_0_0_80x80_MiniFASNetV1SE", "minifasnet_v1se_4.0_80x80".
+_SCALE_IN_NAME = re.compile(r"(?:^|[_-])(\d(?:\.\d+)?)(?:_0_0)?_80x80(?![0-9x])")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,8 +75,6 @@ class LivenessGraph:
         A graph with one image input and one output (batch, classes).
     expects
         Crop, input and reading of the output.
-    normalised
-        Whether the graph ends in a softmax of its own.
 
     Raises
     ------
@@ -77,28 +82,25 @@ class LivenessGraph:
         Where the graph does not run on such an input, or its output does not fit.
     """
 
-    def __init__(
-        self,
-        session: Session,
-        *,
-        input_name: str,
-        sha256: str,
-        expects: LivenessInput,
-        normalised: bool,
-    ) -> None:
+    def __init__(self, session: Session, *, sha256: str, expects: LivenessInput) -> None:
         self._session = session
-        self._input_name = input_name
-        self._normalised = normalised
         self.expects = expects
         self.file = session.name
         self.sha256 = sha256
-        classes = self._output(np.zeros((expects.size, expects.size, 3), np.uint8)).size
+        size = (expects.size, expects.size, 3)
+        noise = np.random.default_rng(0).integers(0, 256, size, dtype=np.uint8)
+        outputs = [self._output(picture) for picture in (np.zeros(size, np.uint8), noise)]
+        # A softmax of its own: logits do not add up to 1 for any picture.
+        self._is_normalised = all(
+            output.min() >= 0 and abs(output.sum() - 1) < 1e-4 for output in outputs
+        )
+        classes = outputs[0].size
         if expects.live_class >= classes or classes < 2:
             raise ModelError(
                 f"{self.file} tells {classes} classes apart; live_class {expects.live_class} is"
                 " none of them. Correct it in pack.toml."
             )
-        if expects.score == "difference" and (classes != 2 or normalised):
+        if expects.score == "difference" and (classes != 2 or self._is_normalised):
             raise ModelError(
                 f'{self.file} does not end in two logits: the score "difference" has no meaning;'
                 ' state "softmax" in pack.toml.'
@@ -129,7 +131,7 @@ class LivenessGraph:
         live = self.expects.live_class
         if self.expects.score == "difference":
             return float(output[live] - output[1 - live])
-        if self._normalised:
+        if self._is_normalised:
             return float(output[live])
         shares = np.exp(output - output.max())
         return float(shares[live] / shares.sum())
@@ -140,7 +142,7 @@ class LivenessGraph:
         low, high = expects.input_range
         values = ordered.astype(np.float32) * np.float32((high - low) / 255) + np.float32(low)
         blob = np.ascontiguousarray(values.transpose(2, 0, 1)[None])
-        output = self._session.run({self._input_name: blob})[0]
+        output = self._session.run({self._session.inputs[0].name: blob})[0]
         if output.ndim != 2 or len(output) != 1 or not np.isfinite(output).all():
             raise ModelError(
                 f"{self.file}: one crop must give one row of finite numbers; got shape"
@@ -194,6 +196,75 @@ class PassiveLiveness:
             If the box is empty, or inference fails.
         """
         return sum(graph.score(picture, box) for graph in self.members) / len(self.members)
+
+
+def open_liveness(
+    graphs: Sequence[PackGraph], stated: PackFile, folder: Path, *, detects: bool
+) -> PassiveLiveness | None:
+    """Make the liveness graphs of a pack ready; None where there is none.
+
+    Raises
+    ------
+    PackError
+        If ``pack.toml`` states a file that is not there, a graph does not do what is stated,
+        nothing says how far its crop reaches, or the pack has no detector.
+    """
+    for stated_graph in stated.liveness:
+        if not (folder / stated_graph.file).is_file():
+            raise PackError(
+                f"pack.toml states the liveness graph {stated_graph.file}; {folder} has none."
+            )
+    if graphs and not detects:
+        raise PackError(
+            f"{folder} has a liveness graph and no detector; liveness is seen on the whole frame:"
+            " add a SCRFD or YuNet .onnx file."
+        )
+    members = []
+    for graph in graphs:
+        expects = expected_input(graph, stated.liveness_of(graph.file))
+        try:
+            members.append(LivenessGraph(graph.session, sha256=graph.sha256, expects=expects))
+        except ModelError as error:
+            raise PackError(f"{graph.path}, as a liveness graph: {error}") from error
+    try:
+        return PassiveLiveness(members) if members else None
+    except ModelError as error:
+        raise PackError(f"{folder}: {error}") from error
+
+
+def expected_input(graph: PackGraph, statement: LivenessStatement | None) -> LivenessInput:
+    """What a graph is fed: as stated, else as MiniFASNet is.
+
+    Raises
+    ------
+    PackError
+        If the size or the scale of the crop is not known, or not what the graph takes.
+    """
+    stated = statement or LivenessStatement(file=graph.file)
+    height, width = image_size(graph.session.inputs) or (None, None)
+    size = height or stated.input_size
+    if height != width or size is None or stated.input_size not in (None, size):
+        raise PackError(
+            f"{graph.path} takes {width or 'any'} x {height or 'any'} pixels; a liveness graph"
+            f" takes a square, and input_size in pack.toml states the side where it is open."
+        )
+    in_name = _SCALE_IN_NAME.search(graph.path.stem)
+    scale = stated.crop_scale or (float(in_name[1]) if in_name else None)
+    if scale is None:
+        raise PackError(
+            f"{graph.path} is a liveness graph, and nothing says how far around the face it looks:"
+            " state crop_scale in pack.toml, under [[liveness]], or give the file back the name"
+            " that its authors gave it, such as 2.7_80x80_MiniFASNetV2.onnx."
+        )
+    return LivenessInput(
+        crop_scale=scale,
+        crop=stated.crop or "box",
+        size=size,
+        channel_order=stated.channel_order or "bgr",
+        input_range=stated.input_range or (0.0, 255.0),
+        live_class=1 if stated.live_class is None else stated.live_class,
+        score=stated.score or "softmax",
+    )
 
 
 def crop_face(picture: NDArray[np.uint8], box: Box, expects: LivenessInput) -> NDArray[np.uint8]:

@@ -15,19 +15,16 @@ from models.boxes import Face, ranked
 from models.decoding import DEFAULT_LIMITS, ImageLimits, decode_image, picture_digest
 from models.demo import DEMO_DIMENSION, is_demo_model, require_face
 from models.detection import DEFAULT_SIZE, Detector, find_faces
-from models.embedding import Embedder, Preprocessing
+from models.embedding import Embedder, Preprocessing, normalises_inside
 from models.errors import ImageError, ModelError, PackError
 from models.faces import FaceCrop, FaceSample
-from models.liveness import PassiveLiveness
-from models.liveness_graphs import open_liveness
+from models.liveness import PassiveLiveness, open_liveness
 from models.orientation import require_upright
-from models.pack_file import PackFile, Triple
-from models.pack_graphs import PackGraph, locate, pick, read_graph
+from models.pack_file import PackFile
+from models.pack_graphs import PackGraph, Role, image_size, locate, pick, read_graph
 from models.quality import DEFAULT_QUALITY, Quality, QualityLimits, check, measure
 from models.scrfd import Scrfd
 from models.selection import FacePolicy, select_face
-from models.sessions import Session
-from models.signature import Role
 from models.yunet import YuNet
 
 
@@ -132,25 +129,28 @@ class ModelPack:
             If a requested provider is absent or does not start.
         """
         location, stated = locate(Path(path))
-        graphs = [read_graph(file, stated) for file in location.files]
+        graphs = [
+            read_graph(file, stated, providers=providers, threads=threads)
+            for file in location.files
+        ]
         embedder_graph, detector_graph = pick(graphs, location.folder)
-        embedder = _embedder(embedder_graph, stated, flip, providers, threads)
+        embedder = _embedder(embedder_graph, stated, flip)
         detector = detector_info = None
         if detector_graph is not None:
-            size = detector_size or stated.detector_size or DEFAULT_SIZE
-            detector = _detector(detector_graph, size, providers, threads)
+            size = detector_size or stated.detector.input_size or DEFAULT_SIZE
+            detector = _detector(detector_graph, size)
             # A size without a common template fails here rather than at the first photo.
             template(embedder.preprocessing.size)
             detector_info = DetectorInfo(
                 kind=detector.kind,
-                file=detector_graph.path.name,
+                file=detector_graph.file,
                 sha256=detector_graph.sha256,
                 input_size=detector.sizes[0],
             )
         info = PackInfo(
             name=location.name,
             n=embedder.n,
-            embedder_file=embedder_graph.path.name,
+            embedder_file=embedder_graph.file,
             embedder_sha256=embedder_graph.sha256,
             preprocessing=embedder.preprocessing.as_dict(),
             detector=detector_info,
@@ -161,14 +161,12 @@ class ModelPack:
             stated,
             location.folder,
             detects=detector is not None,
-            providers=providers,
-            threads=threads,
         )
         return cls(info, embedder=embedder, detector=detector, liveness=liveness)
 
     @cached_property
     def liveness(self) -> PassiveLiveness | None:
-        """The liveness graphs, loaded when they are first asked for; ``None`` where none are.
+        """The liveness graphs, tried when they are first asked for; ``None`` where none are.
 
         Raises
         ------
@@ -364,51 +362,34 @@ class ModelPack:
         return np.asarray(cv2.resize(image, (size, size), interpolation=shrink), dtype=np.uint8)
 
 
-def _embedder(
-    graph: PackGraph,
-    stated: PackFile,
-    flip: bool,
-    providers: Sequence[str],
-    threads: int | None,
-) -> Embedder:
-    size = graph.signature.image_size
+def _embedder(graph: PackGraph, stated: PackFile, flip: bool) -> Embedder:
+    size = image_size(graph.session.inputs)
     fixed = None if size is None else size[0]
-    if fixed is not None and stated.input_size not in (None, fixed):
+    told = stated.embedder
+    if fixed is not None and told.input_size not in (None, fixed):
         raise PackError(
-            f"pack.toml states input_size {stated.input_size}, and {graph.path} takes {fixed}"
-            " only; remove the key."
+            f"pack.toml states input_size {told.input_size}, and {graph.path} takes {fixed} only;"
+            " remove the key."
         )
-    inside = graph.signature.normalises
-    mean: Triple = stated.mean or ((0.0,) * 3 if inside else (127.5,) * 3)
-    scale: Triple = stated.scale or ((1.0,) * 3 if inside else (127.5,) * 3)
-    preprocessing = Preprocessing(
-        alignment=TEMPLATE_NAME,
-        size=int(fixed or stated.input_size or 0),
-        channel_order=stated.channel_order or "rgb",
-        mean=mean,
-        scale=scale,
-        flip=flip,
-    )
-    image = graph.signature.inputs[0]
-    session = Session(graph.model, name=graph.path.name, providers=providers, threads=threads)
-    session.load()
+    side = int(fixed or told.input_size or 0)
     try:
-        return Embedder(
-            session, input_name=image.name, preprocessing=preprocessing, batch=image.shape[0]
+        is_inside = None in (told.mean, told.scale) and normalises_inside(graph.session, side)
+        mean, scale = (0.0, 1.0) if is_inside else (127.5, 127.5)
+        preprocessing = Preprocessing(
+            alignment=TEMPLATE_NAME,
+            size=side,
+            channel_order=told.channel_order or "rgb",
+            mean=told.mean or (mean,) * 3,
+            scale=told.scale or (scale,) * 3,
+            flip=flip,
         )
+        return Embedder(graph.session, preprocessing)
     except ModelError as error:
         raise PackError(f"{graph.path} was routed as an embedder and fails: {error}") from error
 
 
-def _detector(
-    graph: PackGraph, size: int, providers: Sequence[str], threads: int | None
-) -> Detector:
+def _detector(graph: PackGraph, size: int) -> Detector:
     if size < 32 or size % 32:
         raise PackError(f"The detector size must be a multiple of 32, not {size}.")
-    image = graph.signature.inputs[0]
-    height, width = image.shape[2:]
-    fixed = (height, width) if height is not None and width is not None else None
-    session = Session(graph.model, name=graph.path.name, providers=providers, threads=threads)
-    session.load()
     kind = Scrfd if graph.role is Role.SCRFD else YuNet
-    return kind(session, input_name=image.name, size=size, fixed=fixed)
+    return kind(graph.session, size=size)

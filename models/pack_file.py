@@ -25,69 +25,93 @@ Every key but ``file`` is optional; an unknown one is an error.
 """
 
 import tomllib
-from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from models.errors import PackError
 
 FILE_NAME = "pack.toml"
 _MAX_BYTES = 64 * 1024
-_KEYS = {
-    "embedder": {"mean", "scale", "channel_order", "input_size"},
-    "detector": {"input_size"},
-    "liveness": {
-        "file",
-        "crop_scale",
-        "crop",
-        "input_size",
-        "channel_order",
-        "input_range",
-        "live_class",
-        "score",
-    },
-}
 
-Triple = tuple[float, float, float]
-Word = TypeVar("Word", bound=str)
+Number = Annotated[float, Field(gt=-1e6, lt=1e6)]
+ChannelOrder = Literal["rgb", "bgr"]
 
 
-@dataclass(frozen=True, kw_only=True)
-class LivenessStatement:
-    """What is stated of one liveness graph; ``None`` where the file is silent."""
+def _per_channel(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else (value,) * 3
 
-    crop_scale: float | None = None
+
+def _without_zero(scale: tuple[float, ...]) -> tuple[float, ...]:
+    if 0 in scale:
+        raise ValueError("it divides the input and must not be 0")
+    return scale
+
+
+def _ascending(values: tuple[float, float]) -> tuple[float, float]:
+    if values[0] >= values[1]:
+        raise ValueError("the two numbers must ascend, such as [0, 1]")
+    return values
+
+
+Triple = tuple[Number, Number, Number]
+PerChannel = Annotated[Triple, BeforeValidator(_per_channel)]
+Range = Annotated[
+    tuple[Number, Number],
+    BeforeValidator(lambda value: tuple(value) if isinstance(value, list) else value),
+    AfterValidator(_ascending),
+]
+
+
+class _Table(BaseModel):
+    """A value is ``None`` where the file is silent."""
+
+    model_config = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class EmbedderStatement(_Table):
+    """What is stated of the embedder."""
+
+    mean: PerChannel | None = None
+    scale: Annotated[PerChannel, AfterValidator(_without_zero)] | None = None
+    channel_order: ChannelOrder | None = None
+    input_size: Annotated[int, Field(ge=112, le=2048, multiple_of=16)] | None = None
+
+
+class DetectorStatement(_Table):
+    """What is stated of the detector."""
+
+    input_size: Annotated[int, Field(ge=32, le=2048, multiple_of=32)] | None = None
+
+
+class LivenessStatement(_Table):
+    """What is stated of one liveness graph."""
+
+    file: Annotated[str, Field(min_length=1)]
+    crop_scale: Annotated[float, Field(ge=0.5, le=8)] | None = None
     crop: Literal["box", "square"] | None = None
-    input_size: int | None = None
-    channel_order: str | None = None
-    input_range: tuple[float, float] | None = None
-    live_class: int | None = None
+    input_size: Annotated[int, Field(ge=16, le=2048)] | None = None
+    channel_order: ChannelOrder | None = None
+    input_range: Range | None = None
+    live_class: Annotated[int, Field(ge=0, le=15)] | None = None
     score: Literal["softmax", "difference"] | None = None
 
 
-PREPROCESSINGS: dict[str, tuple[Triple, Triple]] = {
-    "arcface": ((127.5, 127.5, 127.5), (127.5, 127.5, 127.5)),
-    "imagenet": ((123.675, 116.28, 103.53), (58.395, 57.12, 57.375)),
-    "raw": ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)),
-}
-"""Mean and scale of RGB pixels from 0 to 255, by the name of the convention."""
+class PackFile(_Table):
+    """What is stated of a pack."""
 
+    embedder: EmbedderStatement = EmbedderStatement()
+    detector: DetectorStatement = DetectorStatement()
+    liveness: list[LivenessStatement] = []
 
-@dataclass(frozen=True, kw_only=True)
-class PackFile:
-    """The stated values; ``None`` where the file is silent. Liveness graphs by their file."""
-
-    mean: Triple | None = None
-    scale: Triple | None = None
-    channel_order: str | None = None
-    input_size: int | None = None
-    detector_size: int | None = None
-    liveness: Mapping[str, LivenessStatement] = field(default_factory=dict)
+    def liveness_of(self, file: str) -> LivenessStatement | None:
+        """Return what is stated of a liveness graph; ``None`` where it is not named."""
+        return next((stated for stated in self.liveness if stated.file == file), None)
 
 
 def read_pack_file(folder: Path) -> PackFile:
-    """Read ``pack.toml`` of a folder; all-``None`` where there is none.
+    """Read ``pack.toml`` of a folder; nothing is stated where there is none.
 
     Raises
     ------
@@ -100,91 +124,27 @@ def read_pack_file(folder: Path) -> PackFile:
     if path.stat().st_size > _MAX_BYTES:
         raise PackError(f"{path} is larger than {_MAX_BYTES} bytes: not a pack.toml.")
     try:
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
+        stated = PackFile.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise PackError(f"{path} is not valid TOML: {error}") from error
-    for table, content in document.items():
-        if table not in _KEYS:
-            raise PackError(f"{path}: unknown table or key '{table}'; known are {_listed(_KEYS)}.")
-        written = f"[[{table}]]" if table == "liveness" else f"[{table}]"
-        for part in content if table == "liveness" and isinstance(content, list) else [content]:
-            if not isinstance(part, dict) or (table == "liveness" and part is content):
-                raise PackError(f"{path}: '{table}' must be a table, written {written}.")
-            unknown = sorted(set(part) - _KEYS[table])
-            if unknown:
-                raise PackError(
-                    f"{path}: unknown key '{unknown[0]}' in {written}; known are"
-                    f" {_listed(_KEYS[table])}."
-                )
-    embedder, detector = document.get("embedder", {}), document.get("detector", {})
-    scale = _triple(path, "scale", embedder)
-    if scale is not None and min(abs(value) for value in scale) == 0:
-        raise PackError(f"{path}: 'scale' divides the input and must not be 0.")
-    return PackFile(
-        mean=_triple(path, "mean", embedder),
-        scale=scale,
-        channel_order=_choice(path, "channel_order", embedder, "rgb", "bgr"),
-        input_size=_size(path, "[embedder]", embedder, multiple=16, least=112),
-        detector_size=_size(path, "[detector]", detector, multiple=32, least=32),
-        liveness=_liveness(path, document.get("liveness", [])),
-    )
-
-
-def _liveness(path: Path, tables: list[dict[str, Any]]) -> dict[str, LivenessStatement]:
-    stated: dict[str, LivenessStatement] = {}
-    for table in tables:
-        file = table.get("file")
-        if not isinstance(file, str) or not file:
-            raise PackError(f"{path}: [[liveness]] needs 'file', the name of its .onnx file.")
-        if file in stated:
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_context=False)[0]
+        place = ".".join(str(part) for part in first["loc"])
+        wrong = "unknown key" if first["type"] == "extra_forbidden" else first["msg"]
+        raise PackError(f"{path}: {place}: {wrong} (docs/models.md lists the keys).") from None
+    files = [graph.file for graph in stated.liveness]
+    for file in files:
+        if files.count(file) > 1:
             raise PackError(f"{path}: [[liveness]] states {file} twice.")
-        stated[file] = LivenessStatement(
-            crop_scale=_number(path, "crop_scale", table, least=0.5, most=8),
-            crop=_choice(path, "crop", table, "box", "square"),
-            input_size=_size(path, "[[liveness]]", table, multiple=1, least=16),
-            channel_order=_choice(path, "channel_order", table, "rgb", "bgr"),
-            input_range=_range(path, table),
-            live_class=_live_class(path, table),
-            score=_choice(path, "score", table, "softmax", "difference"),
-        )
     return stated
 
 
-def _number(
-    path: Path, key: str, table: dict[str, Any], *, least: float, most: float
-) -> float | None:
-    value = table.get(key)
-    if value is None:
-        return None
-    if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value <= most:
-        raise PackError(f"{path}: '{key}' must be a number from {least:g} to {most:g}.")
-    return float(value)
-
-
-def _range(path: Path, table: dict[str, Any]) -> tuple[float, float] | None:
-    value = table.get("input_range")
-    if value is None:
-        return None
-    if (
-        not isinstance(value, list)
-        or len(value) != 2
-        or not all(
-            isinstance(number, int | float) and not isinstance(number, bool) and abs(number) < 1e6
-            for number in value
-        )
-        or value[0] >= value[1]
-    ):
-        raise PackError(f"{path}: 'input_range' must be two numbers that ascend, such as [0, 1].")
-    return float(value[0]), float(value[1])
-
-
-def _live_class(path: Path, table: dict[str, Any]) -> int | None:
-    value = table.get("live_class")
-    if value is not None and (
-        isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 16
-    ):
-        raise PackError(f"{path}: 'live_class' must be a whole number from 0 to 15.")
-    return value
+PREPROCESSINGS: dict[str, tuple[Triple, Triple]] = {
+    "arcface": ((127.5, 127.5, 127.5), (127.5, 127.5, 127.5)),
+    "imagenet": ((123.675, 116.28, 103.53), (58.395, 57.12, 57.375)),
+    "raw": ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)),
+}
+"""Mean and scale of RGB pixels from 0 to 255, by the name of the convention."""
 
 
 def pack_file_text(preprocessing: str) -> str:
@@ -192,47 +152,3 @@ def pack_file_text(preprocessing: str) -> str:
     mean, scale = PREPROCESSINGS[preprocessing]
     rows = (f"mean = {list(mean)}", f"scale = {list(scale)}", 'channel_order = "rgb"')
     return "\n".join(["[embedder]", *rows]) + "\n"
-
-
-def _listed(names: Any) -> str:
-    return ", ".join(sorted(names))
-
-
-def _triple(path: Path, key: str, table: dict[str, Any]) -> Triple | None:
-    value = table.get(key)
-    if value is None:
-        return None
-    numbers = value if isinstance(value, list) else [value] * 3
-    if len(numbers) != 3 or not all(
-        isinstance(number, int | float) and not isinstance(number, bool) and abs(number) < 1e6
-        for number in numbers
-    ):
-        raise PackError(f"{path}: '{key}' must be a number or a list of three numbers.")
-    return (float(numbers[0]), float(numbers[1]), float(numbers[2]))
-
-
-def _choice(path: Path, key: str, table: dict[str, Any], *values: Word) -> Word | None:
-    value = table.get(key)
-    if value is not None and value not in values:
-        expected = " or ".join(f'"{word}"' for word in values)
-        raise PackError(f"{path}: '{key}' must be {expected}, not {value!r}.")
-    return value
-
-
-def _size(
-    path: Path, table: str, content: dict[str, Any], *, multiple: int, least: int
-) -> int | None:
-    value = content.get("input_size")
-    if value is None:
-        return None
-    if (
-        not isinstance(value, int)
-        or isinstance(value, bool)
-        or not least <= value <= 2048
-        or value % multiple
-    ):
-        raise PackError(
-            f"{path}: 'input_size' in {table} must be a multiple of {multiple} from {least} to"
-            f" 2048, not {value!r}."
-        )
-    return value

@@ -1,71 +1,67 @@
-"""The graphs of a model pack: found in a folder, read once, and recognised by their signatures."""
+"""The graphs of a model pack: found in a folder, loaded once, and recognised by their signatures.
+
+A graph's signature is what onnxruntime says of its inputs and outputs; its name does not matter.
+"""
 
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from enum import StrEnum
 from pathlib import Path
-from typing import Any
 
 from models.errors import PackError
 from models.pack_file import PackFile, read_pack_file
-from models.signature import DETECTORS, Role, Signature, classify, read_signature
+from models.sessions import Session, Tensor
+from models.yunet import OUTPUTS as YUNET_OUTPUTS
 
 _SUFFIX = ".onnx"
 # A ResNet-100 embedder has 260 MB; protobuf itself ends at 2 GiB.
 _MAX_MODEL_BYTES = 2**30
 
 
-@dataclass(frozen=True)
-class GraphReport:
-    """What one ``.onnx`` file of a pack is, and why."""
+class Role(StrEnum):
+    """What a graph can do for a pack."""
 
-    file: str
-    role: Role
-    reason: str
-    sha256: str
-    inputs: str
-    outputs: str
+    SCRFD = "scrfd"
+    SCRFD_WITHOUT_KEYPOINTS = "scrfd-without-keypoints"
+    YUNET = "yunet"
+    GENDER_AGE = "gender-age"
+    LANDMARKS = "landmarks"
+    LIVENESS = "liveness"
+    EMBEDDER = "embedder"
+    UNKNOWN = "unknown"
 
 
 @dataclass(frozen=True)
 class PackGraph:
-    """One file of a pack, read once: what is hashed is what runs."""
+    """One file of a pack, read once: what is hashed is what runs.
+
+    Attributes
+    ----------
+    reason
+        One sentence that says what the role was told from.
+    """
 
     path: Path
-    model: bytes = field(repr=False)
+    session: Session = field(repr=False)
     sha256: str
-    signature: Signature
     role: Role
     reason: str
 
+    @property
+    def file(self) -> str:
+        """Name of the file."""
+        return self.path.name
 
-def inspect(path: str | Path) -> list[GraphReport]:
-    """What every graph of a pack is, and why; unusable packs are reported, not refused.
+    @property
+    def inputs(self) -> str:
+        """Names and shapes of the inputs."""
+        return ", ".join(map(str, self.session.inputs))
 
-    Raises
-    ------
-    PackError
-        If there is no ``.onnx`` file, ``pack.toml`` is broken, or a file is no ONNX model.
-    """
-    location, stated = locate(Path(path))
-    return [
-        GraphReport(
-            file=graph.path.name,
-            role=graph.role,
-            reason=graph.reason,
-            sha256=graph.sha256,
-            inputs=_shapes(graph.signature.inputs),
-            outputs=_shapes(graph.signature.outputs),
-        )
-        for graph in (read_graph(file, stated) for file in location.files)
-    ]
-
-
-def _shapes(tensors: Sequence[Any]) -> str:
-    return ", ".join(
-        f"{tensor.name}[{', '.join('?' if d is None else str(d) for d in tensor.shape)}]"
-        for tensor in tensors
-    )
+    @property
+    def outputs(self) -> str:
+        """Names and shapes of the outputs."""
+        return ", ".join(map(str, self.session.outputs))
 
 
 @dataclass(frozen=True)
@@ -75,6 +71,18 @@ class Location:
     name: str
     folder: Path
     files: list[Path]
+
+
+def inspect(path: str | Path) -> list[PackGraph]:
+    """What every graph of a pack is, and why; unusable packs are reported, not refused.
+
+    Raises
+    ------
+    PackError
+        If there is no ``.onnx`` file, ``pack.toml`` is broken, or a file is no ONNX model.
+    """
+    location, stated = locate(Path(path))
+    return [read_graph(file, stated) for file in location.files]
 
 
 def locate(path: Path) -> tuple[Location, PackFile]:
@@ -103,13 +111,21 @@ def locate(path: Path) -> tuple[Location, PackFile]:
     raise PackError(f"{path} has no .onnx files; put the weights of a pack there.")
 
 
-def read_graph(path: Path, stated: PackFile) -> PackGraph:
-    """Read and recognise one graph.
+def read_graph(
+    path: Path,
+    stated: PackFile,
+    *,
+    providers: Sequence[str] = ("cpu",),
+    threads: int | None = None,
+) -> PackGraph:
+    """Load and recognise one graph.
 
     Raises
     ------
     PackError
         If the file cannot be read, is too large, or is no ONNX model.
+    ProviderUnavailable
+        If a requested provider is absent or failed to start.
     """
     try:
         if path.stat().st_size > _MAX_MODEL_BYTES:
@@ -117,13 +133,79 @@ def read_graph(path: Path, stated: PackFile) -> PackGraph:
         model = path.read_bytes()
     except OSError as error:
         raise PackError(f"{path} cannot be read: {error.strerror}.") from error
-    signature = read_signature(model, name=str(path))
-    if path.name in stated.liveness:
+    session = Session(model, name=path.name, providers=providers, threads=threads)
+    if stated.liveness_of(path.name) is not None:
         role, reason = Role.LIVENESS, "stated in pack.toml"
     else:
-        role, reason = classify(signature, input_size=stated.input_size)
-    digest = hashlib.sha256(model).hexdigest()
-    return PackGraph(path, model, digest, signature, role, reason)
+        role, reason = classify(
+            session.inputs, session.outputs, input_size=stated.embedder.input_size
+        )
+    return PackGraph(path, session, hashlib.sha256(model).hexdigest(), role, reason)
+
+
+def image_size(inputs: Sequence[Tensor]) -> tuple[int | None, int | None] | None:
+    """Height and width of the only input where it is an image, else ``None``."""
+    if len(inputs) != 1 or len(inputs[0].shape) != 4 or inputs[0].shape[1] not in (3, None):
+        return None
+    return inputs[0].shape[2], inputs[0].shape[3]
+
+
+def classify(
+    inputs: Sequence[Tensor], outputs: Sequence[Tensor], *, input_size: int | None = None
+) -> tuple[Role, str]:
+    """Route a graph by its signature (docs/models.md "Packs").
+
+    Parameters
+    ----------
+    input_size
+        Side of the embedder's input as stated in ``pack.toml``, for graphs that leave it open.
+
+    Returns
+    -------
+    role : Role
+    reason : str
+        One sentence that says what it was told from.
+    """
+    size = image_size(inputs)
+    last = [output.shape[-1] if output.shape else None for output in outputs]
+    if size is None:
+        return Role.UNKNOWN, "its input is not one float32 image (batch, 3, h, w)"
+    if {output.name for output in outputs}.issuperset(YUNET_OUTPUTS):
+        return Role.YUNET, "outputs cls_8 ... kps_32"
+    match sorted(width or 0 for width in last):
+        case [1, 1, 1, 4, 4, 4, 10, 10, 10]:
+            return Role.SCRFD, "scores, boxes and five points at three strides (9 outputs)"
+        case [1, 1, 1, 4, 4, 4]:
+            return (
+                Role.SCRFD_WITHOUT_KEYPOINTS,
+                "scores and boxes at three strides without keypoints (6 outputs): it cannot align",
+            )
+    if size == (96, 96) and last == [3]:
+        return Role.GENDER_AGE, "96 x 96 input and 3 output values; ignored"
+    if size == (80, 80) and last == [3]:
+        return Role.LIVENESS, "80 x 80 input and 3 output values (MiniFASNet)"
+    if size == (192, 192):
+        return Role.LANDMARKS, "192 x 192 input; ignored"
+    height, width = (input_size if side is None else side for side in size)
+    if height is None or width is None:
+        return (
+            Role.UNKNOWN,
+            "the input size is open; where this is an embedder, state input_size in pack.toml",
+        )
+    if height != width or height < 112 or height % 16:
+        return (
+            Role.UNKNOWN,
+            f"the {width} x {height} input is not a square of at least 112 that 16 divides",
+        )
+    if len(outputs) != 1 or len(outputs[0].shape) != 2:
+        return Role.UNKNOWN, "no known detector, and not exactly one output (batch, values)"
+    if last[0] in (2, 3):
+        return (
+            Role.UNKNOWN,
+            f"{last[0]} output values are no embedding; a liveness graph is stated in pack.toml,"
+            " under [[liveness]]",
+        )
+    return Role.EMBEDDER, f"square {width} x {height} input and one 2-D output"
 
 
 def pick(graphs: Sequence[PackGraph], folder: Path) -> tuple[PackGraph, PackGraph | None]:
@@ -135,10 +217,10 @@ def pick(graphs: Sequence[PackGraph], folder: Path) -> tuple[PackGraph, PackGrap
         If there is no embedder, more than one of a kind, or only a detector without keypoints.
     """
     embedders = [graph for graph in graphs if graph.role is Role.EMBEDDER]
-    detectors = [graph for graph in graphs if graph.role in DETECTORS]
+    detectors = [graph for graph in graphs if graph.role in (Role.SCRFD, Role.YUNET)]
     for kind, several in (("embedders", embedders), ("detectors", detectors)):
         if len(several) > 1:
-            names = " and ".join(graph.path.name for graph in several)
+            names = " and ".join(graph.file for graph in several)
             raise PackError(
                 f"{folder} has {len(several)} {kind}: {names}; leave one of them there."
             )
@@ -149,6 +231,6 @@ def pick(graphs: Sequence[PackGraph], folder: Path) -> tuple[PackGraph, PackGrap
             " the variant with keypoints (its name mostly ends in kps or bnkps)."
         )
     if not embedders:
-        seen = "; ".join(f"{graph.path.name}: {graph.reason}" for graph in graphs)
+        seen = "; ".join(f"{graph.file}: {graph.reason}" for graph in graphs)
         raise PackError(f"{folder} has no embedder. Seen: {seen}.")
     return embedders[0], detectors[0] if detectors else None

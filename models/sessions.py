@@ -1,9 +1,9 @@
 """onnxruntime sessions that run where they were told to run, in bounded memory."""
 
 import os
-import threading
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import onnxruntime as ort
@@ -24,15 +24,11 @@ PROVIDERS = {
 }
 _SHORT = {full: short for short, full in PROVIDERS.items()}
 
-Optimisation = Literal["all", "extended"]
-_LEVELS = {
-    "all": ort.GraphOptimizationLevel.ORT_ENABLE_ALL,
-    "extended": ort.GraphOptimizationLevel.ORT_ENABLE_EXTENDED,
-}
-
 # onnxruntime writes warnings about declared output shapes to stderr for every detector that runs
 # at another size than it was exported for; errors still reach us as exceptions.
 _LOG_ERRORS_ONLY = 3
+# No folder: weights that lie outside the file would escape its hash.
+_NO_FOLDER = f"{os.devnull}/weights"
 
 
 def available_providers() -> list[str]:
@@ -48,22 +44,30 @@ def resolve_providers(names: Sequence[str]) -> list[str]:
     ProviderUnavailable
         If a name is unknown, or its provider is not in the installed onnxruntime.
     """
+    available = ", ".join(available_providers())
     if not names:
-        raise ProviderUnavailable(
-            f"No execution provider was named; available are: {', '.join(available_providers())}."
-        )
-    installed = ort.get_available_providers()
-    resolved = []
-    for name in names:
-        full = PROVIDERS.get(name.lower(), name)
-        if full not in installed:
+        raise ProviderUnavailable(f"No execution provider was named; available are: {available}.")
+    resolved = [PROVIDERS.get(name.lower(), name) for name in names]
+    for name, full in zip(names, resolved, strict=True):
+        if full not in ort.get_available_providers():
             raise ProviderUnavailable(
                 f"The execution provider '{name}' was requested and is not available; available"
-                f" are: {', '.join(available_providers())}. Install the onnxruntime build for"
-                " that accelerator, or request one of these."
+                f" are: {available}. Install the onnxruntime build for that accelerator, or"
+                " request one of these."
             )
-        resolved.append(full)
     return resolved
+
+
+@dataclass(frozen=True)
+class Tensor:
+    """Name and shape of a graph's input or output; a size is ``None`` where any will do."""
+
+    name: str
+    shape: tuple[int | None, ...]
+
+    def __str__(self) -> str:
+        sizes = ", ".join("?" if size is None else str(size) for size in self.shape)
+        return f"{self.name}[{sizes}]"
 
 
 class Session:
@@ -80,9 +84,18 @@ class Session:
         be in use after loading; nothing falls back silently.
     threads
         Threads inside one operator; ``None`` leaves the choice to onnxruntime (all cores).
-    optimisation
-        What onnxruntime may change in the graph: ``all``, its default, or ``extended``, which
-        leaves the layout of the tensors as it is. All else runs with ``all``.
+
+    Attributes
+    ----------
+    inputs, outputs
+        As onnxruntime describes them; ``inputs`` is empty where one is not of float32.
+
+    Raises
+    ------
+    PackError
+        If onnxruntime refuses the graph, or its weights lie in another file.
+    ProviderUnavailable
+        If a requested provider is absent or failed to start.
     """
 
     def __init__(
@@ -92,64 +105,15 @@ class Session:
         name: str,
         providers: Sequence[str] = ("cpu",),
         threads: int | None = None,
-        optimisation: Optimisation = "all",
     ) -> None:
         if threads is not None and threads < 1:
             raise ModelError(f"The number of inference threads must be at least 1, not {threads}.")
         self.name = name
-        self.providers = resolve_providers(providers)
-        self.threads = threads
-        self.optimisation = optimisation
-        self._model: bytes | None = model
-        self._loaded: Any = None
-        self._loading = threading.Lock()
-
-    def load(self) -> None:
-        """Build the onnxruntime session now rather than at the first run.
-
-        Raises
-        ------
-        PackError
-            If onnxruntime refuses the graph.
-        ProviderUnavailable
-            If a requested provider failed to start.
-        """
-        with self._loading:
-            if self._loaded is None:
-                self._loaded = self._create()
-                self._model = None
-
-    def _create(self) -> Any:
-        options = ort.SessionOptions()
-        options.log_severity_level = _LOG_ERRORS_ONLY
-        # Memory patterns are kept for every input shape ever seen, and photos have many shapes.
-        # The arena stays: it levels off at the largest canvas and batch, which are bounded
-        # (docs/models.md has the measurement).
-        options.enable_mem_pattern = False
-        options.enable_cpu_mem_arena = True
-        options.graph_optimization_level = _LEVELS[self.optimisation]
-        if self.threads is not None:
-            options.intra_op_num_threads = self.threads
-            options.inter_op_num_threads = 1
-        # Idle workers sleep: spinning would take the cores from the other sessions of the process.
-        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-        try:
-            session = ort.InferenceSession(
-                self._model, options, providers=self.providers, enable_fallback=0
-            )
-        # onnxruntime raises a family of unrelated classes here; the cause stays attached.
-        except Exception as error:
-            raise PackError(f"{self.name}: onnxruntime cannot load this graph: {error}") from error
-        session.disable_fallback()
-        running = session.get_providers()
-        missing = [name for name in self.providers if name not in running]
-        if missing:
-            raise ProviderUnavailable(
-                f"{self.name}: the execution provider {', '.join(missing)} was requested and did"
-                f" not start; running would be {', '.join(running)}. Check its drivers and"
-                " libraries, or request another provider."
-            )
-        return session
+        self._loaded = _load(model, name, resolve_providers(providers), threads)
+        given = self._loaded.get_inputs()
+        is_float = all(value.type == "tensor(float)" for value in given)
+        self.inputs = tuple(map(_tensor, given)) if is_float else ()
+        self.outputs = tuple(map(_tensor, self._loaded.get_outputs()))
 
     def run(
         self, feeds: Mapping[str, NDArray[np.float32]], outputs: Sequence[str] | None = None
@@ -166,14 +130,51 @@ class Session:
         ModelError
             If onnxruntime fails on these inputs.
         """
-        if self._loaded is None:
-            self.load()
         try:
             results = self._loaded.run(list(outputs) if outputs else None, dict(feeds))
         except Exception as error:
             # Only the kind: onnxruntime may quote values of the input.
             raise ModelError(f"{self.name}: inference failed ({type(error).__name__}).") from None
         return [np.asarray(result) for result in results]
+
+
+def _load(model: bytes, name: str, providers: list[str], threads: int | None) -> Any:
+    options = ort.SessionOptions()
+    options.log_severity_level = _LOG_ERRORS_ONLY
+    # Memory patterns are kept for every input shape ever seen, and photos have many shapes.
+    # The arena stays: it levels off at the largest canvas and batch, which are bounded
+    # (docs/models.md has the measurement).
+    options.enable_mem_pattern = False
+    if threads is not None:
+        options.intra_op_num_threads = threads
+        options.inter_op_num_threads = 1
+    # Idle workers sleep: spinning would take the cores from the other sessions of the process.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    options.add_session_config_entry(
+        "session.model_external_initializers_file_folder_path", _NO_FOLDER
+    )
+    try:
+        session = ort.InferenceSession(model, options, providers=providers, enable_fallback=0)
+    # onnxruntime raises a family of unrelated classes here; the cause stays attached.
+    except Exception as error:
+        raise PackError(
+            f"{name} is not a readable ONNX model: fetch the file again, or, where its weights lie"
+            f" in another file, convert it to a single one. onnxruntime says: {error}"
+        ) from error
+    session.disable_fallback()
+    running = session.get_providers()
+    missing = [provider for provider in providers if provider not in running]
+    if missing:
+        raise ProviderUnavailable(
+            f"{name}: the execution provider {', '.join(missing)} was requested and did not start;"
+            f" running would be {', '.join(running)}. Check its drivers and libraries, or request"
+            " another provider."
+        )
+    return session
+
+
+def _tensor(value: Any) -> Tensor:
+    return Tensor(value.name, tuple(n if isinstance(n, int) else None for n in value.shape))
 
 
 def default_workers() -> int:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import onnx
 from numpy.typing import NDArray
-from onnx import TensorProto, helper
+from onnx import TensorProto, helper, numpy_helper
 
 Dim = int | str
 POOL = 16
@@ -72,17 +72,22 @@ def unit(rows: NDArray[np.float64]) -> NDArray[np.float64]:
 def shaped(
     inputs: Sequence[tuple[str, Sequence[Dim]]], outputs: Sequence[tuple[str, Sequence[Dim]]]
 ) -> bytes:
-    """A graph of the given signature that only ever says what its first input is."""
-    nodes = [helper.make_node("Identity", [inputs[0][0]], [name]) for name, _ in outputs]
+    """A graph of the given signature that gives zeros, whatever it is fed."""
+    zeros = [
+        numpy_helper.from_array(
+            np.zeros([size if isinstance(size, int) else 1 for size in shape], np.float32),
+            f"zeros_{name}",
+        )
+        for name, shape in outputs
+    ]
     graph = helper.make_graph(
-        nodes,
+        [helper.make_node("Identity", [f"zeros_{name}"], [name]) for name, _ in outputs],
         "shaped",
         [_value(name, shape) for name, shape in inputs],
         [_value(name, shape) for name, shape in outputs],
+        zeros,
     )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)])
-    model.ir_version = 8
-    return bytes(model.SerializeToString())
+    return _save(graph)
 
 
 def scrfd_shapes(*, keypoints: bool = True, batched: bool = False) -> bytes:

@@ -13,6 +13,7 @@ from models.errors import ModelError
 from models.pack import ModelPack
 from models.scrfd import Scrfd
 from models.selection import FacePolicy
+from models.sessions import Tensor
 from models.yunet import OUTPUTS, YuNet, _trimmed
 
 STRIDES = (8, 16, 32)
@@ -22,6 +23,7 @@ class Replay:
     """A session that answers with prepared arrays and keeps what it was fed."""
 
     name = "replay.onnx"
+    inputs = (Tensor("x", (1, 3, None, None)),)
 
     def __init__(self, answer):
         self.answer = answer
@@ -106,7 +108,7 @@ def scrfd_answer(hits, *, batched=False, anchors=2):
 def test_scrfd_decodes_distances_from_the_cell(batched, anchors):
     hits = [(16, 1, 2, anchors - 1, 0.9), (8, 7, 0, 0, 0.49)]
     session = Replay(scrfd_answer(hits, batched=batched, anchors=anchors))
-    detector = Scrfd(session, input_name="x", size=64)
+    detector = Scrfd(session, size=64)
     image = np.full((32, 32, 3), 255, np.uint8)  # enlarged by 2
     (face,) = detector.detect_once(image, (64, 64))
     corner = np.array([2 * 16, 1 * 16])
@@ -121,7 +123,7 @@ def test_scrfd_input_is_rgb_minus_half_over_128_on_a_zero_canvas():
     session = Replay(scrfd_answer([]))
     image = np.zeros((32, 64, 3), np.uint8)
     image[..., 0], image[..., 2] = 255, 10
-    Scrfd(session, input_name="x", size=64).detect_once(image, (64, 64))
+    Scrfd(session, size=64).detect_once(image, (64, 64))
     blob = session.fed[0][0]
     np.testing.assert_allclose(blob[:, 0, 0], (np.array([255, 0, 10]) - 127.5) / 128)
     np.testing.assert_allclose(blob[:, -1, -1], -127.5 / 128)
@@ -130,7 +132,7 @@ def test_scrfd_input_is_rgb_minus_half_over_128_on_a_zero_canvas():
 def test_scrfd_refuses_outputs_that_do_not_fit_the_canvas():
     session = Replay(lambda blob, o: scrfd_answer([])(np.zeros((1, 3, 72, 64)), o))
     with pytest.raises(ModelError, match="stride 8 do not fit"):
-        Scrfd(session, input_name="x").detect_once(np.zeros((9, 9, 3), np.uint8), (64, 64))
+        Scrfd(session).detect_once(np.zeros((9, 9, 3), np.uint8), (64, 64))
 
 
 @pytest.mark.parametrize(
@@ -144,7 +146,7 @@ def test_scrfd_drops_candidates_that_no_face_can_be(output, value):
         arrays[output][:] = value
         return arrays
 
-    detector = Scrfd(Replay(answer), input_name="x")
+    detector = Scrfd(Replay(answer))
     assert detector.detect_once(np.zeros((64, 64, 3), np.uint8), (64, 64)) == []
 
 
@@ -168,7 +170,7 @@ def test_yunet_decodes_centres_and_log_sides():
 
     image = np.zeros((40, 70, 3), np.uint8)
     image[...] = [10, 20, 30]
-    (face,) = YuNet(Replay(answer), input_name="x").detect_once(image, (640, 640))
+    (face,) = YuNet(Replay(answer)).detect_once(image, (640, 640))
     assert face.score == pytest.approx(np.sqrt(0.72))
     centre = np.array([3.5, 1.25]) * 16
     np.testing.assert_allclose(
@@ -363,7 +365,7 @@ def test_yunet_does_not_look_twice_at_one_canvas(shape, passes):
         ]
 
     session = Replay(answer)
-    assert find_faces(YuNet(session, input_name="x"), np.zeros((*shape, 3), np.uint8)) == []
+    assert find_faces(YuNet(session), np.zeros((*shape, 3), np.uint8)) == []
     canvases = [blob.shape[2:] for blob in session.fed]
     assert len(canvases) == len(set(canvases)) == passes
 

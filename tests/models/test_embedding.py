@@ -3,13 +3,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from models.embedding import MAX_BATCH, Embedder, Preprocessing
+from models.embedding import MAX_BATCH, Embedder, Preprocessing, normalises_inside
 from models.errors import ModelError
 from models.sessions import Session
 from tests.models.graphs import pooled, pooling_embedder, unit
 
 
-def embedder(model=None, *, batch=None, size=112, **changes) -> Embedder:
+def embedder(model=None, *, size=112, **changes) -> Embedder:
     settings = {
         "alignment": "arcface-112",
         "size": size,
@@ -19,9 +19,7 @@ def embedder(model=None, *, batch=None, size=112, **changes) -> Embedder:
         "flip": False,
     } | changes
     session = Session(model or pooling_embedder(), name="pooling.onnx", threads=1)
-    return Embedder(
-        session, input_name="image", preprocessing=Preprocessing(**settings), batch=batch
-    )
+    return Embedder(session, Preprocessing(**settings))
 
 
 POOLING = embedder()
@@ -53,7 +51,7 @@ def test_no_crops_give_no_rows():
 
 
 def test_a_fixed_batch_is_filled_up():
-    fixed = embedder(pooling_embedder(batch=4), batch=4)
+    fixed = embedder(pooling_embedder(batch=4))
     pictures = crops(6)
     np.testing.assert_allclose(fixed.embed(pictures, flip=False), unit(pooled(pictures)), atol=2e-5)
 
@@ -66,12 +64,22 @@ def test_mean_scale_and_channel_order():
     np.testing.assert_allclose(changed.embed(pictures, flip=False), expected, atol=2e-5)
 
 
-def test_normalisation_inside_the_graph_is_fed_0_to_255():
-    inside = embedder(pooling_embedder(inside=True), mean=(0,) * 3, scale=(1,) * 3)
-    pictures = crops(2)
-    np.testing.assert_allclose(
-        inside.embed(pictures, flip=False), POOLING.embed(pictures, flip=False), atol=1e-5
-    )
+@pytest.mark.parametrize("inside", [True, False])
+@pytest.mark.parametrize("batch", ["N", 3])
+def test_normalisation_inside_a_graph_is_told_by_what_it_tells_apart(inside, batch):
+    model = pooling_embedder(inside=inside, batch=batch)
+    assert normalises_inside(Session(model, name="x.onnx", threads=1), 112) is inside
+
+
+def test_normalisation_inside_real_graphs(shared_data):
+    expected = {
+        "w600k_mbf/w600k_mbf": False,
+        "mobilefacenet128_apache/MobileFaceNet": False,
+        "yunet_mobilefacenet128/mobilefacenet_y1_128d_fp32": True,
+    }
+    for name, inside in expected.items():
+        model = (shared_data / "packs" / f"{name}.onnx").read_bytes()
+        assert normalises_inside(Session(model, name=name, threads=1), 112) is inside
 
 
 @pytest.mark.parametrize("factor", [0.0, float("nan"), float("inf")])

@@ -14,10 +14,8 @@ from models.alignment import template
 from models.errors import ModelError, NoFace, PackError
 from models.liveness import LivenessInput, box_region, crop_face, square_region
 from models.pack import ModelPack
-from models.pack_graphs import inspect
+from models.pack_graphs import Role, inspect
 from models.photos import embed_photos
-from models.sessions import Session
-from models.signature import Role
 from tests.models.graphs import (
     fixed_face_detector,
     mean_liveness,
@@ -280,19 +278,6 @@ def test_pack_toml_wins_over_the_name(tmp_path):
 def test_mistakes_are_named(tmp_path, toml, graphs, said):
     with pytest.raises(PackError, match=said):
         _ = pack_of(tmp_path, toml, **graphs).liveness
-
-
-def test_graphs_are_loaded_when_they_are_first_asked_for(tmp_path, monkeypatch):
-    started = []
-    load = Session.load
-    monkeypatch.setattr(Session, "load", lambda self: started.append(self.name) or load(self))
-    pack = pack_of(tmp_path, **{NAMED: NET})
-    data = png(picture(8))
-    pack.embed_photo(data, quality=None)
-    assert f"{NAMED}.onnx" not in started
-    for _ in range(2):
-        pack.embed_photo(data, quality=None, liveness=True)
-    assert started.count(f"{NAMED}.onnx") == 1
 
 
 def test_liveness_needs_the_whole_frame(tmp_path):

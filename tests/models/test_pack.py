@@ -16,10 +16,9 @@ from models.errors import (
     ProviderUnavailable,
 )
 from models.pack import ModelPack
-from models.pack_graphs import inspect
+from models.pack_graphs import Role, inspect
 from models.quality import QualityLimits
 from models.selection import FacePolicy
-from models.signature import Role
 from tests.models import graphs
 from tests.models.graphs import pooled, pooling_embedder, unit, write_pack
 

@@ -13,8 +13,7 @@ from api.demo.people import Scale
 from api.demo.run import LevelCount, Person, _faults, at_least, run_demo
 from api.http.errors import StartError
 from models.demo import DEMO_NOTICE
-from models.pack_graphs import inspect
-from models.signature import Role
+from models.pack_graphs import Role, inspect
 from tests.api.cli.conftest import run
 
 # Strangers come last. With four, no single one that is accepted by chance keeps both of the first
