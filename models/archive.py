@@ -1,7 +1,6 @@
 """Taking the graphs of a pack out of an archive that a stranger made."""
 
 import errno
-import stat
 import struct
 import zipfile
 import zlib
@@ -16,8 +15,11 @@ MAX_FILE_BYTES = 2**30
 MAX_TOTAL_BYTES = 2 * 2**30
 _PIECE = 2**20
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-_MOST_SHOWN = 100
-"""Characters of a stranger's name in a text."""
+# What `zipfile` raises on archives that are damaged, encrypted, or lie about themselves.
+_BROKEN = (
+    *(zipfile.BadZipFile, zlib.error, struct.error),
+    *(EOFError, RuntimeError, ValueError, OverflowError),
+)
 
 
 def is_archive(file: Path) -> bool:
@@ -31,8 +33,9 @@ def is_archive(file: Path) -> bool:
 def unpack(archive: Path, into: Path) -> tuple[list[Path], list[str]]:
     """Extract the ``.onnx`` files and the ``pack.toml`` of a zip archive, flat, into a folder.
 
-    Nothing else is written, whatever the archive holds. Sizes are counted while bytes are written:
-    what the archive says of them is not trusted.
+    Nothing else is written, whatever the archive holds: a file gets the last part of its entry's
+    path as its name. Sizes are counted while bytes are written: what the archive says of them is
+    not trusted.
 
     Returns
     -------
@@ -44,9 +47,8 @@ def unpack(archive: Path, into: Path) -> tuple[list[Path], list[str]]:
     Raises
     ------
     PackError
-        It is no zip archive; an entry has an absolute path, leads out of the archive, has a name
-        that cannot be printed, is a link, is encrypted, or compressed other than by deflation; two
-        graphs have one name; it is too large; or it has no graph.
+        It is no zip archive, is encrypted, or compressed other than by deflation; two graphs have
+        one name, or one that cannot be printed; it is too large; or it has no graph.
     OSError
         A file cannot be written.
     """
@@ -55,69 +57,52 @@ def unpack(archive: Path, into: Path) -> tuple[list[Path], list[str]]:
     total = 0
     try:
         with zipfile.ZipFile(archive) as opened:
-            entries = opened.infolist()
+            entries = [entry for entry in opened.infolist() if not entry.is_dir()]
             if len(entries) > MAX_ENTRIES:
                 raise PackError(f"The archive has more than {MAX_ENTRIES} entries: not a pack.")
             for entry in entries:
-                name = _checked_name(entry)
-                if entry.is_dir():
-                    continue
+                name = PurePosixPath(entry.filename.replace("\\", "/")).name
                 if not _is_wanted(name):
                     left_out.append(entry.filename)
                     continue
+                _require_plain(entry, name)
                 target = into / name
-                if target.exists():
-                    raise PackError(f"The archive has two files of the name {name[:_MOST_SHOWN]}.")
                 with opened.open(entry) as source, target.open("xb") as file:
-                    total += _copied(source, file, name, most=MAX_TOTAL_BYTES - total)
+                    most = min(MAX_FILE_BYTES, MAX_TOTAL_BYTES - total)
+                    total += _copied(source, file, most=most)
                 written.append(target)
-    except (zipfile.BadZipFile, zlib.error, struct.error, EOFError, RuntimeError) as error:
-        raise _unreadable(error) from error
-    except (ValueError, OverflowError) as error:  # an offset or a name that cannot be
-        raise _unreadable(error) from error
-    except OSError as error:
-        if error.errno not in (None, errno.EINVAL):
+    except FileExistsError:
+        raise PackError("The archive has two files of the same name.") from None
+    except (*_BROKEN, OSError) as error:
+        if isinstance(error, OSError) and error.errno not in (None, errno.EINVAL):
             raise
-        raise _unreadable(error) from error
+        raise PackError(f"The archive cannot be read ({type(error).__name__}).") from error
     if not any(file.suffix.lower() == ".onnx" for file in written):
         raise PackError("The archive has no .onnx file.")
     return written, left_out
-
-
-def _unreadable(error: Exception) -> PackError:
-    return PackError(f"The archive cannot be read ({type(error).__name__}).")
-
-
-def _checked_name(entry: zipfile.ZipInfo) -> str:
-    """The last part of an entry's path; refuse what no honest archive has."""
-    path = PurePosixPath(entry.filename.replace("\\", "/"))
-    # `filename` ends where a NUL stands in the archive.
-    shown = ascii(entry.orig_filename[:_MOST_SHOWN])
-    if not (entry.filename.isprintable() and entry.orig_filename.isprintable()):
-        raise PackError(f"The archive has a name that cannot be printed: {shown}.")
-    if path.is_absolute() or ".." in path.parts or ":" in entry.filename:
-        raise PackError(f"The archive has an entry that leads out of it: {shown}.")
-    if stat.S_ISLNK(entry.external_attr >> 16):
-        raise PackError(f"The archive has a link: {shown}.")
-    if entry.flag_bits & 0x1:
-        raise PackError("The archive is encrypted; extract it yourself.")
-    if entry.compress_type not in _METHODS:
-        raise PackError(
-            f"The archive has an entry that is neither stored nor deflated: {shown}; extract it "
-            "yourself."
-        )
-    return path.name
 
 
 def _is_wanted(name: str) -> bool:
     return not name.startswith(".") and (name.lower().endswith(".onnx") or name == FILE_NAME)
 
 
-def _copied(source: IO[bytes], file: IO[bytes], name: str, *, most: int) -> int:
+def _require_plain(entry: zipfile.ZipInfo, name: str) -> None:
+    if not name.isprintable():
+        raise PackError(f"The archive has a name that cannot be printed: {name[:100]!a}.")
+    if entry.flag_bits & 0x1:
+        raise PackError("The archive is encrypted; extract it yourself.")
+    if entry.compress_type not in _METHODS:
+        raise PackError(
+            f"The archive has an entry that is neither stored nor deflated: {name[:100]}; extract"
+            " it yourself."
+        )
+
+
+def _copied(source: IO[bytes], file: IO[bytes], *, most: int) -> int:
     count = 0
     while piece := source.read(_PIECE):
         count += len(piece)
-        if count > min(MAX_FILE_BYTES, most):
-            raise PackError(f"The archive is too large to be a pack, at {name[:_MOST_SHOWN]}.")
+        if count > most:
+            raise PackError("The archive is too large to be a pack.")
         file.write(piece)
     return count

@@ -4,11 +4,11 @@ An embedding is as sensitive as the face it came from, so there is no way to wri
 clear.
 """
 
-import contextlib
+import io
 import os
-import struct
 import tempfile
 import threading
+import zipfile
 from pathlib import Path
 from typing import Protocol
 
@@ -17,10 +17,7 @@ from numpy.typing import NDArray
 
 from models.errors import CacheError
 
-CONTEXT = "veilface/embedding-cache/1"
-_MAGIC = b"VFEC1\0"
-_HEADER = struct.Struct("<6sII")  # magic, numbers per embedding, entries
-_KEY_BYTES = 32
+CONTEXT = "veilface/embedding-cache/2"
 
 
 class CacheSealer(Protocol):
@@ -38,7 +35,8 @@ class CacheSealer(Protocol):
 class EmbeddingCache:
     """Embeddings by a 32-byte key; safe from several threads.
 
-    Use it bare to keep them in memory, or `open_file` to keep them between runs.
+    Use it bare to keep them in memory, or `open_file` to keep them between runs, in a sealed npz
+    with an array of keys, uint8 (k, 32), and one of embeddings, float32 (k, n), for each n.
     """
 
     def __init__(self) -> None:
@@ -61,7 +59,7 @@ class EmbeddingCache:
         cache = cls()
         cache._path, cache._sealer = Path(path), sealer
         if cache._path.exists():
-            cache._entries = _decode(sealer.open(cache._path.read_bytes(), context=CONTEXT))
+            cache._entries = _unpacked(sealer.open(cache._path.read_bytes(), context=CONTEXT))
         return cache
 
     def __len__(self) -> int:
@@ -86,37 +84,33 @@ class EmbeddingCache:
         with self._lock:
             if self._path is None or self._sealer is None or not self._changed:
                 return
-            sealed = self._sealer.seal(_encode(self._entries), context=CONTEXT)
-            _replace(self._path, sealed)
+            _replace(self._path, self._sealer.seal(_packed(self._entries), context=CONTEXT))
             self._changed = False
 
 
-def _encode(entries: dict[bytes, NDArray[np.float32]]) -> bytes:
-    """Group by dimension, so that packs of different n can share a file."""
-    blocks = []
-    for n in sorted({len(embedding) for embedding in entries.values()}):
+def _packed(entries: dict[bytes, NDArray[np.float32]]) -> bytes:
+    arrays: dict[str, NDArray[np.generic]] = {}
+    for n in {len(embedding) for embedding in entries.values()}:  # packs may share a file
         chosen = {key: value for key, value in entries.items() if len(value) == n}
-        blocks.append(_HEADER.pack(_MAGIC, n, len(chosen)))
-        blocks.extend(key + value.astype("<f4").tobytes() for key, value in chosen.items())
-    return b"".join(blocks)
+        arrays[f"keys_{n}"] = np.array([list(key) for key in chosen], np.uint8)
+        arrays[f"embeddings_{n}"] = np.stack(list(chosen.values()))
+    file = io.BytesIO()
+    np.savez(file, allow_pickle=False, **arrays)
+    return file.getvalue()
 
 
-def _decode(content: bytes) -> dict[bytes, NDArray[np.float32]]:
+def _unpacked(content: bytes) -> dict[bytes, NDArray[np.float32]]:
     entries: dict[bytes, NDArray[np.float32]] = {}
-    position = 0
-    while position < len(content):
-        if len(content) - position < _HEADER.size:
-            raise CacheError("The embedding cache ends inside a header; delete the file.")
-        magic, n, count = _HEADER.unpack_from(content, position)
-        position += _HEADER.size
-        size = _KEY_BYTES + 4 * n
-        if magic != _MAGIC or count * size > len(content) - position:
-            raise CacheError("The file is not an embedding cache of this version; delete it.")
-        for _ in range(count):
-            key = content[position : position + _KEY_BYTES]
-            values = np.frombuffer(content, dtype="<f4", count=n, offset=position + _KEY_BYTES)
-            entries[key] = values.astype(np.float32)
-            position += size
+    try:
+        with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+            for name in arrays.files:
+                if name.startswith("keys_"):
+                    keys = arrays[name].astype(np.uint8, casting="safe")
+                    embeddings = arrays[name.replace("keys", "embeddings")]
+                    rows = embeddings.astype(np.float32, casting="safe")
+                    entries.update(zip(map(bytes, keys), rows, strict=True))
+    except (ValueError, TypeError, LookupError, OSError, EOFError, zipfile.BadZipFile):
+        raise CacheError("The file is not an embedding cache of this version; delete it.") from None
     return entries
 
 
@@ -129,7 +123,5 @@ def _replace(path: Path, content: bytes) -> None:
             file.flush()
             os.fsync(file.fileno())
         Path(name).replace(path)
-    except BaseException:
-        with contextlib.suppress(FileNotFoundError):
-            Path(name).unlink()
-        raise
+    finally:
+        Path(name).unlink(missing_ok=True)

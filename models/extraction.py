@@ -2,15 +2,12 @@
 
 import hashlib
 import json
-import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,12 +19,8 @@ from models.errors import FaceError, ImageError
 from models.pack import ModelPack
 from models.sessions import default_workers
 
-if TYPE_CHECKING:
-    from rich.progress import Progress
-
 CHUNK = 128
 """Photos embedded together. Their crops are in memory at once, photos only one per thread."""
-_QUIET_SECONDS = 2.0
 _KEPT_SECONDS = 15.0
 """Between two writes of the cache, at least: what a killed run loses."""
 
@@ -142,9 +135,7 @@ class Extractor:
             for flip in ([False, True] if mirrored else [pack.info.preprocessing["flip"]])
         )
 
-    def extract(
-        self, paths: Iterable[Source], *, progress: bool | Advance | None = None
-    ) -> Extraction:
+    def extract(self, paths: Iterable[Source], *, progress: Advance | None = None) -> Extraction:
         """Embed files.
 
         Parameters
@@ -153,9 +144,7 @@ class Extractor:
             Files, or encoded photos, in any order; the order of the result follows it. An encoded
             photo stands in the result under its name as a path.
         progress
-            Show a bar on stderr once the run takes more than two seconds; ``None`` only where
-            stderr is a terminal. A function is called instead with the number of files done since
-            the last call.
+            Called with the number of files done since the last call.
 
         Returns
         -------
@@ -168,41 +157,34 @@ class Extractor:
             If inference itself fails, which is not the fault of a file.
         """
         files = [Path(path) if isinstance(path, str) else path for path in paths]
-        rows: list[Embeddings] = []
-        done: list[Path] = []
-        failures: list[Failure] = []
-        cached = 0
-        bar = _Bar(len(files), progress)
+        prepared: list[_Prepared] = []
         keep_after = time.monotonic() + _KEPT_SECONDS
         try:
-            with bar, ThreadPoolExecutor(default_workers()) as pool:
+            with ThreadPoolExecutor(default_workers()) as pool:
                 for start in range(0, len(files), CHUNK):
-                    chunk = files[start : start + CHUNK]
-                    prepared = list(pool.map(self._prepare, chunk))
-                    embedded = self._embed([item for item in prepared if item.crop is not None])
-                    for source, item in zip(chunk, prepared, strict=True):
-                        path = named(source)
-                        if item.failure is not None:
-                            failures.append(item.failure)
-                            continue
-                        cached += item.embedding is not None
-                        rows.append(
-                            embedded[item.key] if item.embedding is None else item.embedding
-                        )
-                        done.append(path)
-                    bar.advance(len(chunk))
+                    chunk = list(pool.map(self._prepare, files[start : start + CHUNK]))
+                    prepared += self._embedded(chunk)
+                    if progress is not None:
+                        progress(len(chunk))
                     keep_after = self._keep(keep_after)
         finally:
             if self._cache is not None:
                 self._cache.flush()
+        done = [(named(file), item) for file, item in zip(files, prepared, strict=True)]
+        rows = [item.embeddings for _, item in done if item.failure is None]
         kinds = [
             np.stack([row[kind] for row in rows])
             if rows
             else np.empty((0, self._pack.info.n), np.float32)
             for kind in range(len(self._kinds))
         ]
-        mirrored = kinds[1] if len(kinds) == 2 else None
-        return Extraction(kinds[0], done, failures, cached, mirrored)
+        return Extraction(
+            kinds[0],
+            [path for path, item in done if item.failure is None],
+            [item.failure for item in prepared if item.failure is not None],
+            sum(item.is_cached for item in prepared),
+            kinds[1] if len(kinds) == 2 else None,
+        )
 
     def _keep(self, after: float) -> float:
         """Write the cache if it is time to; when to do so next, however large the file grows."""
@@ -241,7 +223,7 @@ class Extractor:
             known = () if self._cache is None else tuple(self._cache.get(part) for part in key)
             embeddings = tuple(embedding for embedding in known if embedding is not None)
             if len(embeddings) == len(key):
-                return _Prepared(key, embedding=embeddings)
+                return _Prepared(key, embeddings=embeddings, is_cached=True)
             if marks is not None:
                 image = decode_image(data)
                 crop = align(image, marks, size=self._pack.crop_size)
@@ -256,30 +238,34 @@ class Extractor:
             reason = f"The file cannot be read: {error.strerror}."
             return _Prepared((), failure=Failure(path, "unreadable_file", reason))
 
-    def _embed(self, items: Sequence["_Prepared"]) -> dict[tuple[bytes, ...], Embeddings]:
+    def _embedded(self, chunk: Sequence["_Prepared"]) -> list["_Prepared"]:
         """Embed the crops of a chunk in batches; copies of one file are computed once."""
-        unique = {item.key: item.crop for item in items if item.crop is not None}
+        unique = {item.key: item.crop for item in chunk if item.crop is not None}
         if not unique:
-            return {}
+            return list(chunk)
         crops = np.stack(list(unique.values()))
         kinds: tuple[NDArray[np.float32], ...] = (
             self._pack.embed_both(crops) if len(self._kinds) == 2 else (self._pack.embed(crops),)
         )
-        result = dict(zip(unique, zip(*kinds, strict=True), strict=True))
+        made = dict(zip(unique, zip(*kinds, strict=True), strict=True))
         if self._cache is not None:
-            for key, embeddings in result.items():
+            for key, embeddings in made.items():
                 for part, embedding in zip(key, embeddings, strict=True):
                     self._cache.put(part, embedding)
-        return result
+        return [
+            item if item.crop is None else _Prepared(item.key, embeddings=made[item.key])
+            for item in chunk
+        ]
 
 
 @dataclass(frozen=True, eq=False)
 class _Prepared:
-    """One file before embedding: exactly one of the last three is set."""
+    """One file: its crop, which is to be embedded, its embeddings, or why there is none."""
 
     key: tuple[bytes, ...] = field(repr=False)
     crop: NDArray[np.uint8] | None = field(default=None, repr=False)
-    embedding: Embeddings | None = field(default=None, repr=False)
+    embeddings: Embeddings = field(default=(), repr=False)
+    is_cached: bool = False
     failure: Failure | None = None
 
 
@@ -297,51 +283,3 @@ def _read(source: Path | EncodedImage | MarkedPhoto) -> bytes:
     with source.open("rb") as file:
         # One byte more than allowed, so that the decoder sees that it is too much.
         return file.read(DEFAULT_LIMITS.max_bytes + 1)
-
-
-class _Bar:
-    """A progress bar that appears when the work turns out to be long."""
-
-    def __init__(self, total: int, wish: bool | Advance | None) -> None:
-        self._total = total
-        self._shown = sys.stderr.isatty() if wish is None else wish is True
-        self._tell = wish if callable(wish) else None
-        self._started = time.monotonic()
-        self._done = 0
-        self._progress: Progress | None = None
-
-    def __enter__(self) -> "_Bar":
-        return self
-
-    def advance(self, count: int) -> None:
-        self._done += count
-        if self._tell is not None:
-            self._tell(count)
-        if not self._shown:
-            return
-        if self._progress is None:
-            if time.monotonic() - self._started < _QUIET_SECONDS:
-                return
-            from rich import console, progress  # here: a service draws nothing
-
-            self._progress = progress.Progress(
-                progress.TextColumn("Embedding faces"),
-                progress.BarColumn(),
-                progress.MofNCompleteColumn(),
-                progress.TextColumn("{task.fields[speed]:.0f} photos/s"),
-                progress.TimeRemainingColumn(),
-                console=console.Console(stderr=True),
-            )
-            self._progress.start()
-            self._progress.add_task("faces", total=self._total, speed=0.0)
-        speed = self._done / max(time.monotonic() - self._started, 1e-3)
-        self._progress.update(self._progress.task_ids[0], completed=self._done, speed=speed)
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        if self._progress is not None:
-            self._progress.stop()

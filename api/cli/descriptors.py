@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from api.cli.console import message
+from api.cli.console import message, progress
 from api.cli.errors import CommandError, UsageError
 from api.service.opening import file_sealer, open_keyring
 from api.settings import Settings
@@ -76,7 +76,9 @@ def extract(
         No photo gave an embedding.
     """
     kept = open_cache(cache, settings)
-    extraction = Extractor(pack, aligned=aligned, cache=kept).extract(photos)
+    extractor = Extractor(pack, aligned=aligned, cache=kept)
+    with progress("embedding faces", len(photos)) as advance:
+        extraction = extractor.extract(photos, progress=advance)
     if kept is not None:
         kept.flush()
     if not extraction.paths:

@@ -150,20 +150,6 @@ def test_a_function_is_told_how_many_are_done(pack, files, monkeypatch):
     assert told == [3, 3, 1]
 
 
-def test_the_bar_appears_only_when_asked_and_late(pack, files, monkeypatch, capsys):
-    Extractor(pack).extract(files, progress=True)
-    Extractor(pack).extract(files)
-    assert capsys.readouterr() == ("", "")
-    monkeypatch.setattr(extraction, "_QUIET_SECONDS", 0.0)
-    Extractor(pack).extract(files, progress=False)
-    assert capsys.readouterr() == ("", "")
-    Extractor(pack).extract(files, progress=True)
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert "7/7" in err
-    assert "photos/s" in err
-
-
 def test_repr_shows_no_numbers(pack, files):
     result = Extractor(pack).extract(files[:1])
     assert "descriptors" not in repr(result)

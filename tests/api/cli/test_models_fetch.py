@@ -136,7 +136,7 @@ def test_preprocessing_is_stated_where_the_graph_does_not(site: Site, graph: byt
 def test_what_cannot_be_used_is_not_kept(site: Site, graph: bytes) -> None:
     site.files["/broken.onnx"] = graph[:1000]
     site.files["/page.onnx"] = b"<html>sign in</html>"
-    site.files["/evil.zip"] = zipped({"../rec.onnx": graph})
+    site.files["/evil.zip"] = zipped({"rec\u202e.onnx": graph})
     site.files["/text"] = b"hello"
     for path in ("broken.onnx", "page.onnx", "evil.zip", "text", "absent.zip"):
         refused = fetch("mine", "--from", f"{site.url}/{path}")

@@ -24,7 +24,7 @@ CLASSES = {"gender": GENDERS, "race": RACES}
 def labelled(root: Path, part: str, count: int, extractor: Extractor) -> LabelledFaces:
     labels = read_labels(root / f"fairface_label_{part}.csv")
     photos = sorted((root / part).glob("*.jpg"))[:count]
-    found = extractor.extract(photos, progress=False)
+    found = extractor.extract(photos)
     names = [f"{part}/{Path(str(path)).name}" for path in found.paths]
     columns = {name: [str(each) for each in labels.column(name, names)] for name in CLASSES}
     return LabelledFaces.of_names(found.descriptors, columns, CLASSES)
