@@ -205,8 +205,9 @@ def _outcomes(outcomes: Sequence[Row]) -> Iterable[str]:
         return
     yield "## Attacks on templates"
     yield (
-        "Success in % with its interval and counts, at the level named; D_sys is no share, and is "
-        "given as it is."
+        "Success is the successful attack rate (SAR) of ISO/IEC 30136, in % with its interval and "
+        "counts, at the level named; D_sys is no share, and is given as it is. AUC: how often a "
+        "guess is nearer to a photo of its own person than of another; 0.5 tells nothing."
     )
     for scheme in dict.fromkeys(Scheme.of(row) for row in shown):
         yield f"### {plain(str(scheme))}: attacks"
@@ -218,6 +219,7 @@ def _outcomes(outcomes: Sequence[Row]) -> Iterable[str]:
                 "level",
                 "success",
                 "chance",
+                "AUC",
                 "cosine to truth",
                 "judged",
             ],
@@ -229,20 +231,18 @@ def _outcomes(outcomes: Sequence[Row]) -> Iterable[str]:
                     plain(row["level"]),
                     _measured(row),
                     significant(row["chance"]),
+                    fixed(row["details"].get("auc"), 3),
                     fixed(row["details"].get("cosine_to_truth_mean"), 3),
                     "yes" if row["judged"] else f"no: {plain(row['unjudged'])}",
                 ]
                 for row in shown
                 if Scheme.of(row) == scheme
             ],
-            [True, True, True, True, False, False, False, True],
+            [True, True, True, True, False, False, False, False, True],
         )
     yield "### What each attacker has and does"
-    said = dict.fromkeys((row["attack"], row["variant"], row["assumption"]) for row in shown)
-    yield "\n".join(
-        f"- **{plain(name)}{': ' + plain(variant) if variant else ''}**: {plain(text)}"
-        for name, variant, text in said
-    )
+    said = dict.fromkeys((row["attack"], row["assumption"]) for row in shown)
+    yield "\n".join(f"- **{plain(name)}**: {plain(text)}" for name, text in said)
 
 
 def _measured(row: Row) -> str:

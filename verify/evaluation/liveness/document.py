@@ -186,7 +186,7 @@ HOW_TO_READ = """## How to read this
 - In brackets the 95 % interval: people are resampled where they are known (never narrower than Wilson's), else Wilson's, as if the photos were independent. In parentheses errors of photos.
 - A threshold that was set on these very photos flatters: apply one of other photos, `--contract`.
 - D-EER: where APCER and BPCER are equal, or nearest to it.
-- IAPMR: share of the attacks with a photo of an enrolled person that the whole verification accepts for that person; a photo without a face is not accepted.
+- IAPMR (IAPAR, its rate of acceptance by the full system, in ISO/IEC 30107-3:2023): share of the attacks with a photo of an enrolled person that the whole verification accepts for that person; a photo without a face is not accepted.
 - Another camera, light or attack gives other rates (docs/liveness.md)."""  # noqa: E501
 
 
