@@ -219,7 +219,7 @@ def _verified(
 
 def _write(results: Json, out: Path) -> list[Path]:
     # Imported here: drawing loads a library that nothing else needs.
-    from verify.evaluation.figures.liveness import liveness_figure
+    from verify.evaluation.figures import liveness_figure
     from verify.evaluation.figures.style import write
 
     files = [out / "results.json", out / "results.csv", out / "results.md"]

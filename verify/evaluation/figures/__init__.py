@@ -5,10 +5,10 @@ from pathlib import Path
 from typing import Any
 
 from verify.evaluation.figures.bars import verification_figure
-from verify.evaluation.figures.curves import det_figure
+from verify.evaluation.figures.det import det_figure, liveness_figure
 from verify.evaluation.figures.style import write
 
-__all__ = ["det_figure", "verification_figure", "write_figures"]
+__all__ = ["det_figure", "liveness_figure", "verification_figure", "write_figures"]
 
 
 def write_figures(results: Mapping[str, Any], folder: Path | str) -> list[Path]:

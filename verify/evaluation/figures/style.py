@@ -153,21 +153,3 @@ def name_groups(
         fontsize=SMALL_SIZE,
         annotation_clip=False,
     )
-
-
-def mark_cut(axes: Axes) -> None:
-    """Draw the two strokes across the foot of the vertical axis that say it does not start at 0."""
-    stroke = [(-1.0, -0.6), (1.0, 0.6)]
-    for height in (0.018, 0.042):
-        axes.plot(
-            [0],
-            [height],
-            transform=axes.transAxes,
-            marker=stroke,
-            markersize=11,
-            markeredgecolor=INK,
-            color=INK,
-            linestyle="none",
-            clip_on=False,
-            zorder=6,
-        )

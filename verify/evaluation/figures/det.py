@@ -1,0 +1,190 @@
+"""DET curves: one error rate over the other on normal-deviate axes, with bands of uncertainty."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from scipy.special import ndtr, ndtri
+
+from verify.evaluation.figures.style import (
+    DASHES,
+    HUES,
+    INK,
+    MARKERS,
+    QUIET,
+    RULE,
+    house_style,
+    panels,
+    side_legend,
+)
+from verify.evaluation.row_labels import (
+    LIFTED_MODES,
+    METRIC_NAMES,
+    MODE_NAMES,
+    Row,
+    datasets_of,
+    order_of,
+    preferred_metric,
+    strategy_label,
+)
+from verify.metrics import wilson
+
+Look = dict[str, Any]
+RATE_TICKS = (1e-6, 1e-5, 1e-4, 1e-3, 0.01, 0.05, 0.2, 0.5, 0.8, 0.95, 0.99, 0.999)
+SMALLEST = 1e-7
+BAND_ALPHA = 0.11
+PANEL_INCHES = (4.6, 4.3)
+SIDE_INCHES = 2.75
+EQUAL: Look = {"color": QUIET, "linewidth": 0.9}
+
+
+def det_figure(results: Mapping[str, Any]) -> Figure | None:
+    """Draw FNMR over FMR; None where no lifted or raw curve is there.
+
+    One panel for each data set and mode. The metric is spherical where it was run, and of the
+    dimensions the smallest and the largest that all strategies of the panel have; raw embeddings
+    are in every panel as a reference. Bands are 95 %.
+    """
+    curves = [curve for curve in results["curves"] if len(curve["fmr"]) > 1]
+    names = [name for name in datasets_of(results) if any(c["dataset"] == name for c in curves)]
+    if not names:
+        return None
+    present = {curve["mode"] for curve in curves}
+    # Without lifting the reference alone makes one panel.
+    modes = [mode for mode in LIFTED_MODES if mode in present] or ["p2p"]
+    looks: dict[str, Look] = {"raw": {"color": INK, "linewidth": 2.2, "zorder": 4}}
+    handles: dict[str, Line2D] = {}
+    with house_style():
+        figure, grid = _panels(len(names), len(modes))
+        for line, name in zip(grid, names, strict=True):
+            for axes, mode in zip(line, modes, strict=True):
+                shown = shown_curves([c for c in curves if c["dataset"] == name], mode)
+                dims = sorted({curve["dim"] for curve in shown if curve["dim"]})
+                drawn = []
+                for curve in shown:
+                    label = strategy_label(curve)
+                    look = looks.setdefault(label, _look(len(looks) - 1))
+                    handles.setdefault(label, Line2D([], [], **look, label=label))
+                    dash = DASHES[1] if curve["dim"] in dims[:-1] else DASHES[0]
+                    drawn.append((curve, look | {"linestyle": dash}))
+                draw_det(axes, drawn, "FMR", "FNMR")
+                metric = next((c["metric"] for c in shown if c["mode"] == mode), None)
+                kind = MODE_NAMES[mode]
+                kind += f", {METRIC_NAMES[metric]}" if metric and mode in LIFTED_MODES else ""
+                axes.set_title(f"{name}, {kind}", loc="left")
+                for dim, dash, word in zip(
+                    (dims[-1:] + dims[:-1]), DASHES, ("solid", "dashed"), strict=False
+                ):
+                    key = f"{word}: m = {dim}"
+                    handles.setdefault(key, Line2D([], [], color=QUIET, linestyle=dash, label=key))
+        handles["equal"] = Line2D([], [], **EQUAL, label="FMR = FNMR")
+        side_legend(figure, list(handles.values()), SIDE_INCHES)
+    return figure
+
+
+def liveness_figure(results: Row) -> Figure:
+    """Draw BPCER over APCER of each species, with the 95 % band of the BPCER.
+
+    A cross marks each threshold of the results on the curve of its species. An APCER of 0 is drawn
+    as that of half a photo, where the axis begins.
+    """
+    live = int(results["rows"][0]["bpcer"]["trials"])
+    half = {row["species"]: 0.5 / row["apcer"]["trials"] for row in results["rows"]}
+    drawn, handles = [], []
+    with house_style():
+        figure, grid = _panels(1, 1)
+        for number, curve in enumerate(results["curves"]):
+            bands = np.array([wilson(rate * live, live) for rate in curve["bpcer"]])
+            apcer = np.maximum(curve["apcer"], half[curve["species"]])
+            rates = {"fmr": apcer, "fnmr": curve["bpcer"], "low": bands[:, 0], "high": bands[:, 1]}
+            drawn.append((rates, _look(number)))
+            handles.append(Line2D([], [], **_look(number), label=curve["species"]))
+        axes = grid[0][0]
+        draw_det(axes, drawn, "APCER", "BPCER")
+        cross: Look = {"marker": "x", "color": QUIET, "linestyle": "none"}
+        for row in results["rows"]:
+            apcer_of_row = max(row["apcer"]["value"], half[row["species"]])
+            axes.plot([apcer_of_row], [row["bpcer"]["value"]], **cross)
+        axes.set_title(f"{results['dataset']['name']}, presentation attacks", loc="left")
+        handles += [Line2D([], [], **EQUAL, label="APCER = BPCER")]
+        handles += [Line2D([], [], **cross, label="threshold")]
+        side_legend(figure, handles, SIDE_INCHES)
+    return figure
+
+
+def shown_curves(curves: Sequence[Row], mode: str) -> list[Row]:
+    """Return the curves of one panel, out of those of one data set, in the order of the tables."""
+    lifted = [curve for curve in curves if curve["mode"] == mode and mode in LIFTED_MODES]
+    metric = preferred_metric(lifted)
+    lifted = [curve for curve in lifted if curve["metric"] == metric]
+    by_group: dict[str, set[int]] = {}
+    for curve in lifted:
+        by_group.setdefault(strategy_label(curve), set()).add(int(curve["dim"]))
+    shared = set.intersection(*by_group.values()) if by_group else set()
+    ends = {label: {min(shared or dims), max(shared or dims)} for label, dims in by_group.items()}
+    lifted = [curve for curve in lifted if int(curve["dim"]) in ends[strategy_label(curve)]]
+    raw = [curve for curve in curves if curve["strategy"] == "raw"]
+    return sorted(raw + lifted, key=order_of)
+
+
+def _panels(rows: int, columns: int) -> tuple[Figure, list[list[Axes]]]:
+    width, height = PANEL_INCHES
+    return panels(
+        rows, columns, widths=[width] * columns, heights=[height] * rows, side=SIDE_INCHES
+    )
+
+
+def _look(number: int) -> Look:
+    """Return how the curve of a strategy or species is drawn: hue and marker."""
+    return {
+        "color": HUES[number % len(HUES)],
+        "marker": MARKERS[number % len(MARKERS)],
+        "linewidth": 1.7,
+        "markersize": 6,
+        "markeredgecolor": "white",
+        "markeredgewidth": 0.7,
+    }
+
+
+def draw_det(axes: Axes, curves: Iterable[tuple[Row, Look]], x: str, y: str) -> None:
+    """Draw the rate ``fnmr`` of each curve over its ``fmr``, with the band from low to high.
+
+    Parameters
+    ----------
+    x, y
+        Names of the two rates.
+    """
+    drawn = []
+    for place, (curve, look) in enumerate(curves):
+        # A rate of 0 has no deviate: the line leaves the panel through its foot.
+        fmr, fnmr, low, high = (
+            np.clip(np.asarray(curve[name], dtype=np.float64), SMALLEST, 1 - SMALLEST)
+            for name in ("fmr", "fnmr", "low", "high")
+        )
+        step = max(1, len(fmr) // 6)
+        # Six markers, at places of its own: those of close curves do not pile up.
+        axes.plot(fmr, fnmr, **look, markevery=(place * step // len(MARKERS) % step, step))
+        axes.fill_between(fmr, low, high, color=look["color"], alpha=BAND_ALPHA, linewidth=0)
+        drawn.append(np.stack([fmr, fnmr]))
+    every = np.concatenate(drawn, axis=1)
+    seen = every[1][(every[1] > 10 * SMALLEST) & (every[0] <= 0.5)]
+    bottom = 0.8 * float(seen.min(initial=0.0125))
+    top = min(0.999, max(0.2, float(seen.max(initial=0.2)) * 1.05))
+    for axis, low_end, high_end in (("x", float(every[0].min()), 0.5), ("y", bottom, top)):
+        getattr(axes, f"set_{axis}scale")("function", functions=(_deviate, ndtr))
+        ticks = [rate for rate in RATE_TICKS if low_end * 0.999 <= rate <= high_end]
+        names = [f"{100 * rate:.4f}".rstrip("0").rstrip(".") for rate in ticks]
+        getattr(axes, f"set_{axis}ticks")(ticks, names)
+        getattr(axes, f"set_{axis}lim")((low_end, high_end))
+    axes.plot([SMALLEST, 0.999], [SMALLEST, 0.999], **EQUAL)
+    axes.set_xlabel(f"{x} %")
+    axes.set_ylabel(f"{y} %")
+    axes.grid(color=RULE, linewidth=0.8)
+
+
+def _deviate(rate: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    return np.asarray(ndtri(np.clip(rate, SMALLEST, 1 - SMALLEST)), dtype=np.float64)
