@@ -6,19 +6,13 @@ suffix), or all photos of a person, by the name of the person's folder.
 """
 
 import csv
-import re
 from bisect import bisect_right
-from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from verify.datasets import SUFFIXES, DatasetError, faults_in
-from verify.fairface_labels import AGES, repaired_age
-
-if TYPE_CHECKING:
-    import _csv
+from verify.datasets import SUFFIXES, DatasetError, decoded, read_whole
+from verify.fairface_labels import repaired_age
 
 MAX_BYTES = 16 * 2**20
 MAX_GROUPS = 256
@@ -27,13 +21,6 @@ YEARS = (0, 2, 5, 8, 11, 14, 18, 30, 45, 60)
 """First year of each group of ages; below ten years a few years make much of a difference."""
 # FairFace's mark of the photos of its own service test; it says nothing about a person.
 _NO_ATTRIBUTE = "service_test"
-# A month, as spreadsheets write it in English or German, or two equal separators between numbers.
-_DATE = re.compile(
-    r"(?<![a-zäöü])(jan|feb|mar|mrz|mär|apr|may|mai|jun|jul|aug|sep|oct|okt|nov|dec|dez)"
-    r"(uary|uar|ruary|ruar|ch|z|il|e|i|y|ust|t|tember|ober|ember)?(?![a-zäöü])"
-    r"|\d\s*([-/.])\s*\d+\s*\3\s*\d",
-    re.IGNORECASE,
-)
 
 
 @dataclass(frozen=True, repr=False)
@@ -51,14 +38,17 @@ class Labels:
     _stems: Mapping[str, Mapping[str, str]] = field(init=False, compare=False)
 
     def __post_init__(self) -> None:
-        by_stem: defaultdict[str, list[Mapping[str, str]]] = defaultdict(list)
-        for name, row in self.of.items():
-            by_stem[_stem(name)].append(row)
+        names: dict[str, list[str]] = {}
+        for name in self.of:
+            names.setdefault(_stem(name), []).append(name)
         # Where rows differ in their suffix only, each speaks for its own file alone; a row
         # without suffix speaks for the others.
-        alone = {stem: rows[0] for stem, rows in by_stem.items() if len(rows) == 1}
-        plain = {name: row for name, row in self.of.items() if _stem(name) == name}
-        object.__setattr__(self, "_stems", alone | plain)
+        speakers = {
+            stem: own[0] if len(own) == 1 else stem
+            for stem, own in names.items()
+            if len(own) == 1 or stem in own
+        }
+        object.__setattr__(self, "_stems", {stem: self.of[name] for stem, name in speakers.items()})
 
     def __repr__(self) -> str:
         return f"Labels({len(self.of)} rows of {', '.join(self.attributes)})"
@@ -97,68 +87,42 @@ def read_labels(file: Path | str) -> Labels:
     Raises
     ------
     DatasetError
-        Listing every fault with its line: no such columns, wrong numbers of cells, a row without
-        a path, two rows of one path that differ, an attribute with too many labels, an age that
-        is none of FairFace's beside others that are, or that is a date.
+        Naming the first fault with its line: no such columns, wrong numbers of cells, a row without
+        a path, two rows of one path that differ, an attribute with too many labels.
     """
     path = Path(file)
+    text = decoded(read_whole(path, most=MAX_BYTES), file=path)
+    reader = csv.reader(text.splitlines(keepends=True), strict=True)
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise DatasetError(f"{path.name} is larger than {MAX_BYTES} bytes; is it a label file?")
-        with path.open(encoding="utf-8-sig", newline="") as stream:
-            return _read(path, csv.reader(stream, strict=True))
-    except FileNotFoundError:
-        raise DatasetError(f"the label file {path.name} is not there") from None
-    except (OSError, UnicodeDecodeError, csv.Error):
-        raise DatasetError(f"{path.name} cannot be read as a CSV file in UTF-8") from None
-
-
-def _read(path: Path, reader: "_csv.Reader") -> Labels:
-    lines = (
-        (reader.line_num, cells)
-        for cells in ([cell.strip() for cell in line] for line in reader)
-        if any(cells)
-    )
-    header = next(lines, None)
-    if header is None:
-        raise DatasetError(f"{path.name} is empty; expected the columns path,gender,race …")
-    attributes = _attributes(path, header[1])
-    kept = tuple(name for name in attributes if name != _NO_ATTRIBUTE)
-    groups: dict[str, dict[str, int]] = {attribute: {} for attribute in kept}
-    made: dict[tuple[str, ...], dict[str, str]] = {}
-    of: dict[str, dict[str, str]] = {}
-    faults: list[str] = []
-    for number, cells in lines:
-        if len(cells) != len(attributes) + 1:
-            faults.append(
-                f"line {number} has {len(cells)} cells, and the header {len(attributes) + 1}"
-            )
-            continue
-        name = _normal(cells[0])
-        if not name:
-            faults.append(f"line {number} has no path")
-            continue
-        key = tuple(cells[1:])
-        if key not in made:
-            # Rows of the same labels share them: there are far fewer of these than rows.
-            made[key] = _labels(attributes, key)
-            for attribute, label in made[key].items():
-                groups[attribute].setdefault(label, number)
-            if crowded := [name for name in kept if len(groups[name]) > MAX_GROUPS]:
-                faults.append(
-                    f"the column {crowded[0]} has more than {MAX_GROUPS} different labels, which "
-                    "are names or numbers and no groups: remove the column, or put its values "
-                    "into ranges"
-                )
-                break
-        if of.setdefault(name, made[key]) != made[key]:
-            faults.append(f"line {number} labels {name} otherwise than a line before it")
-    faults += _faults_of_ages(groups.get("age", {}))
-    if not of and not faults:
-        faults.append("there is no row below the header")
-    if faults:
-        raise DatasetError(faults_in(Path(path.name), "expected labels as in its header", faults))
-    return Labels(attributes=kept, of=of)
+        attributes = _attributes(path, [cell.strip().lower() for cell in next(reader, [])])
+        of: dict[str, dict[str, str]] = {}
+        groups: dict[str, set[str]] = {attribute: set() for attribute in attributes}
+        for line in reader:
+            cells = [cell.strip() for cell in line]
+            if not any(cells):
+                continue
+            where = f"{path.name}: line {reader.line_num}"
+            if len(cells) != len(attributes) + 1:
+                header = len(attributes) + 1
+                raise DatasetError(f"{where} has {len(cells)} cells, and the header {header}")
+            name, labels = _normal(cells[0]), _labels(attributes, cells[1:])
+            if not name:
+                raise DatasetError(f"{where} has no path")
+            if of.setdefault(name, labels) != labels:
+                raise DatasetError(f"{where} labels {name} otherwise than a line before it")
+            for attribute, label in labels.items():
+                groups[attribute].add(label)
+                if len(groups[attribute]) > MAX_GROUPS:
+                    raise DatasetError(
+                        f"{path.name}: the column {attribute} has more than {MAX_GROUPS} different "
+                        "labels, which are names or numbers and no groups: remove the column, or "
+                        "put its values into ranges"
+                    )
+    except csv.Error as error:
+        raise DatasetError(f"{path.name} cannot be read as a CSV file ({error})") from None
+    if not of:
+        raise DatasetError(f"{path.name} has no row below the header")
+    return Labels(tuple(name for name in attributes if name != _NO_ATTRIBUTE), of)
 
 
 def _labels(attributes: Sequence[str], cells: Sequence[str]) -> dict[str, str]:
@@ -182,30 +146,13 @@ def age_group(years: int) -> str:
     return f"{YEARS[place - 1]}-{YEARS[place] - 1}"
 
 
-def _faults_of_ages(ages: Mapping[str, int]) -> list[str]:
-    """Name what is wrong with the ages, given the line on which each comes first."""
-    if not ages.keys().isdisjoint(AGES):
-        return [
-            f"line {number}: the age is none of {', '.join(AGES)}, which others are, and no date "
-            "that a spreadsheet makes of one"
-            for age, number in ages.items()
-            if age not in AGES
-        ]
-    return [
-        f"line {number}: the age is a date; write it as a range, such as 3-9, in a column of text"
-        for age, number in ages.items()
-        if _DATE.search(age)
-    ]
-
-
 def _attributes(path: Path, header: Sequence[str]) -> list[str]:
-    names = [name.lower() for name in header]
-    if names[0] not in ("path", "file"):
+    if not header or header[0] not in ("path", "file"):
         raise DatasetError(
             f"the first column of {path.name} is not path or file; expected a header such as "
             "path,gender,race,age"
         )
-    attributes = names[1:]
+    attributes = list(header[1:])
     if not set(attributes) - {_NO_ATTRIBUTE} or "" in attributes:
         raise DatasetError(
             f"{path.name} needs a name for each column, and one attribute at least beside the "

@@ -46,7 +46,7 @@ FAILED: list[tuple[list[str], str]] = [
         "decoys of 256 numbers each, the embeddings have 32; build the decoys with this pack",
     ),
     (["--decoys", "ABSENT"], "absent: No such file or directory"),
-    (["--labels", "ABSENT"], "the label file absent is not there"),
+    (["--labels", "ABSENT"], "absent is not there"),
     (["--labels", "AUDIT"], "the first column of audit.json is not path or file"),
 ]
 

@@ -1,11 +1,8 @@
 """Label files: what they say about a picture, and what is wrong with a broken one."""
 
-import tracemalloc
-from pathlib import PurePosixPath
-
 import pytest
 
-from verify.datasets import SUFFIXES, DatasetError
+from verify.datasets import DatasetError
 from verify.evaluation import labels_file
 from verify.evaluation.labels_file import read_labels
 from verify.fairface_labels import AGES, GENDERS, RACES
@@ -69,16 +66,6 @@ def test_ages_are_repaired(tmp_path, cell, age):
 
 
 @pytest.mark.parametrize(
-    "age",
-    ["03. Sep", "2024-09-03", "9/3/2024", "3-Sep-24", "3. März", "Okt 19", "September 3",
-     "03.09.2024", "2024-09-03 00:00:00", "12-DEC", "May-20", "3 . 9.2024"],
-)  # fmt: skip
-def test_ages_that_are_dates_are_refused(tmp_path, age):
-    with pytest.raises(DatasetError, match="line 3: the age is a date"):
-        read_labels(written(tmp_path, f"path,age\na,adult\nb,{age}\n"))
-
-
-@pytest.mark.parametrize(
     ("years", "group"),
     [("0", "0-1"), ("1", "0-1"), ("2", "2-4"), ("10", "8-10"), ("29", "18-29"),
      ("30", "30-44"), ("59", "45-59"), ("60", "60 and more"), ("116", "60 and more")],
@@ -94,30 +81,6 @@ def test_other_ages_are_labels(tmp_path, age):
     assert labels.find("b") == {"age": age}
 
 
-@pytest.mark.parametrize(
-    "name", ["a/b.jpg", "./a//b.png", "a/./b/", "/a/b", "a.b", "a/.jpg", "a.jpg/b", ".jpg", "a.JPG"]
-)
-def test_paths_are_taken_as_pathlib_takes_them(name):
-    path = PurePosixPath(name)
-    assert labels_file._normal(name) == str(path)
-    stem = str(path.with_suffix("")) if path.suffix.lower() in SUFFIXES else str(path)
-    assert labels_file._stem(str(path)) == stem
-
-
-def test_large_files_are_read_row_by_row(tmp_path):
-    text = "path,gender\n" + "".join(f"{i:06d},Male\n" for i in range(40_000))
-    file = written(tmp_path, text)
-    tracemalloc.start()
-    labels = read_labels(file)
-    _, peak = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert len(labels.of) == 40_000
-    # Rows of the same labels share one mapping; beside what is kept, one row at a time is in
-    # memory, and the paths without suffix while they are sorted out.
-    assert len({id(row) for row in labels.of.values()}) == 1
-    assert peak < 40_000 * 400
-
-
 def test_cells_may_hold_commas_and_rows_may_repeat(tmp_path):
     labels = read_labels(
         written(tmp_path, 'path,race\n"Lee, Ann",Black\n\n"Lee, Ann",Black\n , \n')
@@ -128,7 +91,7 @@ def test_cells_may_hold_commas_and_rows_may_repeat(tmp_path):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("", "is empty"),
+        ("", "first column of labels.csv is not path or file"),
         ("name,gender\na,Male\n", "first column of labels.csv is not path or file"),
         ("path\na\n", "one attribute at least"),
         ("path,service_test\na,TRUE\n", "one attribute at least"),
@@ -138,10 +101,6 @@ def test_cells_may_hold_commas_and_rows_may_repeat(tmp_path):
         ("path,gender\na,Male,White\n", "line 2 has 3 cells, and the header 2"),
         ("path,gender\n,Male\n", "line 2 has no path"),
         ("path,gender\na,Male\n\na,Female\n", "line 4 labels a otherwise"),
-        ("path,age\na,adult\nb,12-Dec\n", "line 3: the age is a date"),
-        ("path,age\na,12-Dec\nb,0-2\n", "line 2: the age is none of 0-2, 3-9"),
-        ("path,age\na,20-29\nb,adult\n", "line 3: the age is none of 0-2, 3-9"),
-        ("path,age\na,19-Oct\nb,03. Sep\n", "line 3: the age is none of 0-2, 3-9"),
         ('path,gender\n"a,Male\n', "cannot be read as a CSV"),
     ],
 )
@@ -150,21 +109,10 @@ def test_faults_are_named(tmp_path, text, said):
         read_labels(written(tmp_path, text))
 
 
-def test_all_faults_are_listed_with_their_lines(tmp_path):
-    with pytest.raises(DatasetError) as caught:
-        read_labels(written(tmp_path, "path,age\na\nb,12-Dec\n,3-9\nc,3-9\nc,10-19\n"))
-    message = str(caught.value)
-    assert "4 faults" in message
-    assert all(f"line {number}" in message for number in (2, 3, 4, 6))
-    many = "path,gender\n" + ",Male\n" * 25
-    with pytest.raises(DatasetError, match=r"25 faults.*and 5 more"):
-        read_labels(written(tmp_path, many))
-
-
 def test_a_column_of_names_is_no_attribute(tmp_path):
     # What follows the label too many is not read, whatever it is.
     rows = "".join(f"{i},{i},Male\n" for i in range(257)) + "x\n"
-    said = r"1 fault, .*the column name has more than 256 different labels"
+    said = r"the column name has more than 256 different labels"
     with pytest.raises(DatasetError, match=said):
         read_labels(written(tmp_path, "path,name,gender\n" + rows))
     kept = "".join(f"{i},{i % 256},Male\n" for i in range(257))
@@ -174,11 +122,9 @@ def test_a_column_of_names_is_no_attribute(tmp_path):
 def test_files_that_are_no_label_files_are_refused(tmp_path, monkeypatch):
     with pytest.raises(DatasetError, match=r"absent\.csv is not there"):
         read_labels(tmp_path / "absent.csv")
-    with pytest.raises(DatasetError, match="cannot be read"):
-        read_labels(tmp_path)
     file = tmp_path / "labels.csv"
     file.write_bytes(b"path,gender\n\xff\xfe,Male\n")
-    with pytest.raises(DatasetError, match="cannot be read as a CSV file in UTF-8"):
+    with pytest.raises(DatasetError, match="is not UTF-8 text"):
         read_labels(file)
     monkeypatch.setattr(labels_file, "MAX_BYTES", 10)
     with pytest.raises(DatasetError, match="larger than 10 bytes"):

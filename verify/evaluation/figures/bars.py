@@ -158,9 +158,14 @@ def _dress(axes: Axes, places: Mapping[tuple[str, int], float], floor: float, ti
 
 
 def _legend(figure: Figure, metrics: Sequence[str]) -> None:
-    whisker: dict[str, Any] = {"marker": "|", "markersize": 11, "markeredgewidth": 1.1, "linestyle": "none"}
+    whisker: dict[str, Any] = {
+        "marker": "|",
+        "markersize": 11,
+        "markeredgewidth": 1.1,
+        "linestyle": "none",
+    }
     handles: list[Patch | Line2D] = [
-        *(Patch(label=METRIC_NAMES[metric], linewidth=0.8, **LOOKS[metric]) for metric in metrics),
+        *(Patch(label=METRIC_NAMES[name], linewidth=0.8, **LOOKS[name]) for name in metrics),
         Line2D([], [], label="raw", **RAW_LINE),
         Line2D([], [], color=INK, label="± 1 std over folds", **whisker),
     ]

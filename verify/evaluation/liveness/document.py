@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from models.liveness import PassiveLiveness
 from templates.contract.document import Contract
@@ -22,12 +23,12 @@ from verify.evaluation.markdown_cells import (
 )
 from verify.evaluation.plan import Json
 from verify.evaluation.provenance import Model, software
+from verify.evaluation.tables import failure_list
 from verify.metrics import equal_error_rate, error_curve
 
 FORMAT = "veilface liveness evaluation"
 VERSION = 1
 CONTRACT_POINT = "contract"
-LISTED_FAILURES = 20
 CURVE_POINTS = 400
 
 
@@ -62,16 +63,25 @@ def document(
     """
     presented = scored.presented
     species = [name for name in presented.species if len(scored.scored(name)[0])]
-    rows = [row for point in points for row in _rows(scored, species, point, verified)]
+    live = scored.scored(None)[0]
+    verification: Json = {"measured": False, "reason": unverified}
+    if verified is not None:
+        verification = {
+            "measured": True,
+            "level": verified.level,
+            "target_fmr": verified.target_fmr,
+            "enrolled_subjects": verified.enrolled,
+            "enrolled_photos": verified.enrolled_photos,
+            "left_out": list(verified.left_out),
+            "frr": _rate(verified.false_rejections(None)),
+        }
+    policy = None if contract is None or contract.liveness is None else contract.liveness.to_json()
     return {
         "format": FORMAT,
         "version": VERSION,
         "software": software(),
-        "model": {
-            **model.json(),
-            "liveness": [graph.as_dict() for graph in liveness.members],
-        },
-        "contract": None if contract is None else _contract(contract),
+        "model": {**model.json(), "liveness": [graph.as_dict() for graph in liveness.members]},
+        "contract": contract and {"contract_id": contract.contract_id, "liveness": policy},
         "dataset": {
             "name": presented.name,
             "kind": presented.kind,
@@ -85,35 +95,11 @@ def document(
             {"image": failure.path.name, "code": failure.code, "reason": failure.reason}
             for failure in scored.failures
         ],
-        "rows": rows,
-        "eer": {
-            name: equal_error_rate(scored.scored(None)[0], scored.scored(name)[0])[0]
-            for name in species
-        },
-        "verification": _verification(verified, unverified),
+        "rows": [row for point in points for row in _rows(scored, species, point, verified)],
+        "eer": {name: equal_error_rate(live, scored.scored(name)[0])[0] for name in species},
+        "verification": verification,
         "refused": list(refused),
-        "curves": [_curve(scored, name) for name in species],
-    }
-
-
-def _contract(contract: Contract) -> Json:
-    return {
-        "contract_id": contract.contract_id,
-        "liveness": None if contract.liveness is None else contract.liveness.to_json(),
-    }
-
-
-def _verification(verified: VerifiedSet | None, unverified: str | None) -> Json:
-    if verified is None:
-        return {"measured": False, "reason": unverified}
-    return {
-        "measured": True,
-        "level": verified.level,
-        "target_fmr": verified.target_fmr,
-        "enrolled_subjects": verified.enrolled,
-        "enrolled_photos": verified.enrolled_photos,
-        "left_out": list(verified.left_out),
-        "frr": _rate(verified.false_rejections(None)),
+        "curves": [_curve(live, scored.scored(name)[0], name) for name in species],
     }
 
 
@@ -136,41 +122,34 @@ def _rows(
             "worst": name == worst,
             "apcer": _rate(passed[name]),
             "bpcer": _rate(rejected),
-            "iapmr_without_liveness": _verified(verified, name, None),
-            "iapmr": _verified(verified, name, point.threshold),
-            "frr": None if verified is None else _rate(verified.false_rejections(point.threshold)),
+            "iapmr_without_liveness": verified and _rate(verified.iapmr(name, None)),
+            "iapmr": verified and _rate(verified.iapmr(name, point.threshold)),
+            "frr": verified and _rate(verified.false_rejections(point.threshold)),
         }
         for name in species
     ]
-
-
-def _verified(verified: VerifiedSet | None, species: str, threshold: float | None) -> Json | None:
-    return None if verified is None else _rate(verified.iapmr(species, threshold))
 
 
 def _rate(rate: Rate) -> Json:
     return {"value": rate.value if rate.trials else None, **rate.to_json()}
 
 
-def _curve(scored: ScoredSet, species: str) -> Json:
+def _curve(live: ArrayLike, attacks: ArrayLike, species: str) -> Json:
     """APCER and BPCER at every threshold, thinned to a size that a figure shows."""
-    curve = error_curve(scored.scored(None)[0], scored.scored(species)[0])
+    curve = error_curve(live, attacks)
     total = len(curve.thresholds)
     kept = np.unique(np.linspace(0, total - 1, min(total, CURVE_POINTS)).round().astype(int))
-    return {
-        "species": species,
-        "apcer": curve.fmr[kept].tolist(),
-        "bpcer": curve.fnmr[kept].tolist(),
-    }
+    rates = {"apcer": curve.fmr[kept].tolist(), "bpcer": curve.fnmr[kept].tolist()}
+    return {"species": species, **rates}
 
 
 def markdown(results: Json) -> str:
     """Return the report. It has no date, so that the same run gives the same text."""
     dataset = results["dataset"]
     parts = [f"# Presentation attack detection: {plain(dataset['name'])}", _provenance(results)]
-    for name in dict.fromkeys(row["operating_point"] for row in results["rows"]):
-        rows = [row for row in results["rows"] if row["operating_point"] == name]
-        parts += [f"## {_title(name)}", _headline(rows), _table(rows)]
+    for name, rows in _by_point(results):
+        rates = _table(rows, ("apcer", "bpcer"), ("APCER %", "BPCER %"))
+        parts += [f"## {_title(name)}", _headline(rows), rates]
     parts += ["## Through the whole verification", *_through(results)]
     parts += ["## Photos without a face", *_non_responses(results)]
     if results["refused"]:
@@ -178,6 +157,11 @@ def markdown(results: Json) -> str:
         parts.append("\n".join(f"- {plain(sentence)}" for sentence in results["refused"]))
     parts.append(HOW_TO_READ)
     return "\n\n".join(parts) + "\n"
+
+
+def _by_point(results: Json) -> list[tuple[str, list[Json]]]:
+    names = dict.fromkeys(row["operating_point"] for row in results["rows"])
+    return [(n, [row for row in results["rows"] if row["operating_point"] == n]) for n in names]
 
 
 HOW_TO_READ = """## How to read this
@@ -223,48 +207,27 @@ def _headline(rows: Sequence[Json]) -> str:
     )
 
 
-def _table(rows: Sequence[Json]) -> str:
-    return table(
-        ["species", "APCER %", "BPCER %"],
-        [
-            [plain(row["species"]), interval_cell(row["apcer"]), interval_cell(row["bpcer"])]
-            for row in rows
-        ],
-        [True, False, False],
-    )
+def _table(rows: Sequence[Json], names: Sequence[str], titles: Sequence[str]) -> str:
+    """Return a table of rates by species."""
+    lines = [[plain(row["species"]), *(interval_cell(row[name]) for name in names)] for row in rows]
+    return table(["species", *titles], lines, [True, *(False for _ in names)])
 
 
 def _through(results: Json) -> list[str]:
     facts = results["verification"]
     if not facts["measured"]:
         return [f"IAPMR was not measured: {plain(facts['reason'])}."]
-    left_out = (
-        f"; left out: {', '.join(map(plain, facts['left_out']))}" if facts["left_out"] else ""
-    )
-    lines = [
-        [
-            _point(row["operating_point"]),
-            plain(row["species"]),
-            interval_cell(row["iapmr_without_liveness"]),
-            interval_cell(row["iapmr"]),
-            interval_cell(row["frr"]),
-        ]
-        for row in results["rows"]
-    ]
+    left_out = f"; left out: {', '.join(map(plain, facts['left_out']))}" * bool(facts["left_out"])
+    titles = ("IAPMR % without liveness", "IAPMR %", "FRR %")
     return [
         f"Level {plain(facts['level'])}; {count(facts['enrolled_subjects'])} subjects enrolled by "
         f"{count(facts['enrolled_photos'])} live photos each{left_out}. FRR of their other live "
         f"photos without liveness, in %: {interval_cell(facts['frr'])}.",
-        table(
-            ["threshold", "species", "IAPMR % without liveness", "IAPMR %", "FRR %"],
-            lines,
-            [True, True, False, False, False],
+        *(
+            f"{_title(name)}:\n\n{_table(rows, ('iapmr_without_liveness', 'iapmr', 'frr'), titles)}"
+            for name, rows in _by_point(results)
         ),
     ]
-
-
-def _point(name: str) -> str:
-    return name if name == CONTRACT_POINT else f"{name} of these photos"
 
 
 def _non_responses(results: Json) -> list[str]:
@@ -274,17 +237,8 @@ def _non_responses(results: Json) -> list[str]:
         [f"{plain(name)} (APNRR)", interval_cell(rate), percent(results["eer"].get(name))]
         for name, rate in dataset["apnrr"].items()
     ]
-    parts = [
+    return [
         "They have no score, and are in neither APCER nor BPCER.",
         table(["photos", "without a face %", "D-EER %"], lines, [True, False, False]),
+        *([failure_list(results["failures"])] if results["failures"] else []),
     ]
-    failures = results["failures"]
-    if failures:
-        listed = [
-            f"- {code(failure['image'])}: {plain(failure['code'])}"
-            for failure in failures[:LISTED_FAILURES]
-        ]
-        if len(failures) > LISTED_FAILURES:
-            listed.append(f"- and {count(len(failures) - LISTED_FAILURES)} more, in results.json")
-        parts.append("\n".join(listed))
-    return parts
