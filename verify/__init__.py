@@ -7,7 +7,7 @@ from verify.calibration import Calibrated, CalibrationReport, calibrate
 from verify.calibration_mode import CalibrationOptions
 from verify.challenge import MAX_FRAMES, MIN_FRAMES, Movement, draw_movements
 from verify.datasets import DatasetError, LabelledFolder, labelled_folder, read_lfw_pairs
-from verify.decision import Decision
+from verify.decision import Decision, StandIn
 from verify.photo_probe import (
     MAX_PROBE_PHOTOS,
     PhotoProbe,
@@ -15,7 +15,6 @@ from verify.photo_probe import (
     probe_of_frames,
     probe_of_photos,
 )
-from verify.stand_ins import StandIn
 from verify.verifier import OpenedTemplate, Verifier
 
 __all__ = [

@@ -14,7 +14,6 @@ from templates.errors import ContractError
 from templates.keys.randomness import KEY_BYTES, Keystream
 from templates.space.embedding import unit_descriptors
 from templates.space.lifting import plain_strategy
-from templates.space.subspace import SubspaceBatch
 from verify.calibration_mode import (
     CalibrationOptions,
     CalibrationRun,
@@ -24,12 +23,24 @@ from verify.calibration_mode import (
     point_sets,
 )
 from verify.comparisons import Lifter, Progress, honest_norms
-from verify.consistency import Consistency, photo_consistency
+from verify.consistency import (
+    Consistency,
+    SuspiciousPair,
+    photo_consistency,
+    suspicious_pairs,
+)
 from verify.group_rates import PeopleGroups, PhotoLabels, people_groups
-from verify.raw_pairs import SuspiciousPair, suspicious_pairs
 from verify.tenfold import Pair, TenFold, pair_arrays, random_pairs, require_folds
 from verify.trials import ProbeSets, TrialPlan, chosen_photos, enrolled_means, plan_trials
 
+SUSPICIOUS_ABOVE = 0.5
+"""Raw cosine from which two people are reported as suspiciously alike. On LFW with ArcFace the
+cosine of different people passes 0.37 once in 100,000 pairs, and half of the same person's pairs
+reach 0.6."""
+_ENROLLED = 0.3
+"""Share of the time that has passed, on LFW, once people are enrolled."""
+DEVIATIONS = 6.0
+"""Of similarities to strangers, above the mean of honest templates: the largest that passes."""
 DEFAULT_LEVELS = ("fmr-1e-4", "fmr-1e-3", "fmr-1e-2")
 """The first that all calibrations resolve is the default; 1e-4 is NIST SP 800-63B-4's."""
 
@@ -57,7 +68,6 @@ class CalibrationReport:
     unresolved: tuple[str, ...]
     left_out: tuple[str, ...]
     suspicious: tuple[SuspiciousPair, ...]
-    suspicious_above: float
     ten_folds: tuple[TenFold, ...]
 
 
@@ -67,12 +77,6 @@ class Calibrated:
 
     contract: Contract
     report: CalibrationReport
-
-
-_ENROLLED = 0.3
-"""Share of the time that has passed, on LFW, once people are enrolled."""
-DEVIATIONS = 6.0
-"""Of similarities to strangers, above the mean of honest templates: the largest that passes."""
 
 
 def part_of(progress: Progress, first: float, last: float) -> Progress:
@@ -165,17 +169,31 @@ def calibrate(
     consistency = photo_consistency(
         data, plan.person_of, photos=options.photos_per_enrollment, rng=rng
     )
-    run = _lay_out(
-        data,
-        plan,
-        binding=binding,
-        source=source,
-        options=options,
-        cohort_seed=cohort_seed,
-        attributes=None if attributes is None else [attributes[index] for index in kept],
+    service = Lifter(binding.strategy, source, binding.contract_id)
+    generator = client_source(source)
+    progress("enrolling people", 0.0)
+    with Keystream.seeded("calibration templates", options.seed) as stream:
+        templates = service.lift(
+            enrolled_means(data, plan)[plan.compared],
+            m=binding.m,
+            stream=stream,
+            attributes=attributes
+            and [attributes[kept[plan.enrolled[person][0]]] for person in plan.compared],
+        )
+    if cohort_seed is None:
+        with Keystream.fresh() as stream:
+            cohort_seed = stream.token(KEY_BYTES)
+    run = CalibrationRun(
+        descriptors=data,
+        plan=plan,
+        templates=templates,
+        nobody=Nobody(generator, binding.strategy, binding.m, cohort_seed),
+        service=service,
+        client=Lifter(plain_strategy(binding.strategy), generator, binding.contract_id),
         pairs=placed,
         groups=groups,
         consistency=consistency,
+        options=options,
         facts={
             "dataset": dataset,
             **({"groups_from": labels.source} if labels is not None else {}),
@@ -197,7 +215,7 @@ def calibrate(
     kinds: list[ProbeSets | int] = [*sets, *dims]
     for number, kind in enumerate(kinds):
         first, last = (
-            _ENROLLED + (1 - _ENROLLED) * place / len(kinds) for place in (number, number + 1)
+            _ENROLLED + (1 - _ENROLLED) * done / len(kinds) for done in (number, number + 1)
         )
         part = replace(run, progress=part_of(progress, first, last))
         results.append(
@@ -214,9 +232,8 @@ def calibrate(
             unresolved=tuple(sentence for one in results for sentence in one.unresolved),
             left_out=tuple(sentence for one in results for sentence in one.left_out),
             suspicious=tuple(
-                suspicious_pairs(data, plan.person_of, plan.people, above=options.suspicious_above)
+                suspicious_pairs(data, plan.person_of, plan.people, above=SUSPICIOUS_ABOVE)
             ),
-            suspicious_above=options.suspicious_above,
             ten_folds=tuple(one.folds for one in results if one.folds is not None),
         ),
     )
@@ -228,7 +245,7 @@ def _contract(
     calibrations: Sequence[Calibration],
     recorded: Mapping[str, Json],
 ) -> Contract:
-    consistency = run.consistency
+    consistency, near = run.consistency, run.nobody.stranger_similarity(run.templates)
     return Contract(
         binding=binding,
         recorded={
@@ -241,62 +258,8 @@ def _contract(
         photo_consistency=consistency.threshold,
         probe_consistency=consistency.probe_threshold,
         template_foot_point_norm=honest_norms(run.templates.foot_norms),
-        template_stranger_similarity=_honest_similarity(run.nobody, run.templates),
+        template_stranger_similarity=float(near.mean() + DEVIATIONS * near.std()),
         cohort_seed=run.nobody.cohort_seed,
-    )
-
-
-def _honest_similarity(nobody: Nobody, templates: SubspaceBatch) -> float:
-    """Largest similarity to strangers of an honest template, with a margin."""
-    near = nobody.stranger_similarity(templates)
-    return float(near.mean() + DEVIATIONS * near.std())
-
-
-def _lay_out(
-    data: NDArray[np.float32],
-    plan: TrialPlan,
-    *,
-    binding: Binding,
-    source: DecoySource,
-    options: CalibrationOptions,
-    cohort_seed: bytes | None,
-    attributes: Sequence[Attributes] | None,
-    pairs: tuple[Pair, ...],
-    groups: tuple[PeopleGroups, ...],
-    consistency: Consistency,
-    facts: Mapping[str, Json],
-    progress: Progress,
-) -> CalibrationRun:
-    """Enroll everybody; draw the seed of a cohort where none is given."""
-    service = Lifter(binding.strategy, source, binding.contract_id)
-    generator = client_source(source)
-    client = Lifter(plain_strategy(binding.strategy), generator, binding.contract_id)
-    progress("enrolling people", 0.0)
-    means = enrolled_means(data, plan)
-    with Keystream.seeded("calibration templates", options.seed) as stream:
-        templates = service.lift(
-            means[plan.compared],
-            m=binding.m,
-            stream=stream,
-            attributes=attributes
-            and [attributes[plan.enrolled[person][0]] for person in plan.compared],
-        )
-    if cohort_seed is None:
-        with Keystream.fresh() as stream:
-            cohort_seed = stream.token(KEY_BYTES)
-    return CalibrationRun(
-        descriptors=data,
-        plan=plan,
-        templates=templates,
-        nobody=Nobody(generator, binding.strategy, binding.m, cohort_seed),
-        service=service,
-        client=client,
-        pairs=pairs,
-        groups=groups,
-        consistency=consistency,
-        options=options,
-        facts=facts,
-        progress=progress,
     )
 
 

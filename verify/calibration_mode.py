@@ -43,6 +43,8 @@ from verify.trials import ProbeSets, TrialPlan, probe_sets
 Protocol: TypeAlias = Literal["fmr", "ten-fold"]
 
 ACCURACY_LEVEL = "accuracy"
+GROUPED = 10 / 3
+"""How many more comparisons are made where people are labelled: a group has a part of them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,26 +60,18 @@ class CalibrationOptions:
     probe_photos
         Numbers of photos that raw probes are the means of; those beyond 1 are calibrated where
         ``least_people`` have as many photos left over after the enrollment.
-    least_people
-        See ``probe_photos``.
     photos_per_enrollment
         Most photos averaged into one template.
     targets
         FMR targets, powers of ten; those that the data cannot resolve are left out and reported.
-    suspicious_above
-        Raw cosine from which two people are reported as suspiciously alike. On LFW with ArcFace
-        descriptors the cosine of different people passes 0.37 once in 100,000 pairs, and half of
-        the same person's pairs reach 0.6.
     most_templates
         Most people whose templates are compared with; the others only probe. All where people are
         labelled.
     most_cells
-        Most p-to-s comparisons: FMR 1e-6 is resolved by 10 million.
-    averaged_cells
-        As ``most_cells``, for probes of several photos; FMR 1e-5 is resolved by a million, of
-        300,000 pairs of people: 125 people with so many photos and ``most_templates`` others.
-    grouped
-        By how much both are larger where people are labelled: a group has a part of the trials.
+        Most p-to-s comparisons: FMR 1e-6 is resolved by 10 million. An eighth of it for probes of
+        several photos; FMR 1e-5 is resolved by a million, of 300,000 pairs of people: 125 people
+        with so many photos and ``most_templates`` others. ``GROUPED`` times as many where people
+        are labelled.
     lifted_probes, lifted_impostor_pairs
         Size of the random subset of s-to-s comparisons, for each probe dimension.
     worst_group
@@ -95,11 +89,8 @@ class CalibrationOptions:
     least_people: int = 50
     targets: tuple[float, ...] = TARGETS
     photos_per_enrollment: int = 3
-    suspicious_above: float = 0.5
     most_templates: int = 2_400
     most_cells: int = 12_000_000
-    averaged_cells: int = 1_500_000
-    grouped: float = 10 / 3
     lifted_probes: int = 2_000
     lifted_impostor_pairs: int = 300_000
     worst_group: bool = False
@@ -156,10 +147,10 @@ class CalibrationRun:
 def point_sets(run: CalibrationRun, rng: np.random.Generator) -> list[ProbeSets]:
     """Choose the raw probes of every number of photos that the people allow."""
     templates, options = len(run.templates), run.options
-    times = options.grouped if run.groups else 1
+    times = GROUPED if run.groups else 1
     chosen = []
     for photos in sorted(options.probe_photos):
-        cells = options.most_cells if photos == 1 else options.averaged_cells
+        cells = options.most_cells // (1 if photos == 1 else 8)
         most = max(1, int(times * cells) // templates)
         sets = probe_sets(run.plan, photos, most=most, rng=rng)
         genuine = run.plan.person_of[sets.photos[: sets.genuine, 0]]
@@ -170,7 +161,6 @@ def point_sets(run: CalibrationRun, rng: np.random.Generator) -> list[ProbeSets]
 
 def calibrate_points(run: CalibrationRun, sets: ProbeSets) -> ModeResult:
     """Calibrate raw probes of one number of photos."""
-    photos = sets.photos.shape[1]
     impostors, genuine = point_trials(
         run.descriptors,
         run.plan,
@@ -181,7 +171,7 @@ def calibrate_points(run: CalibrationRun, sets: ProbeSets) -> ModeResult:
         consistency=run.consistency.probe_threshold,
         progress=run.progress,
     )
-    return _calibration(run, impostors, genuine, probe_m=0, probe_photos=photos, norms=None)
+    return _calibration(run, impostors, genuine, probe_photos=sets.photos.shape[1])
 
 
 def calibrate_lifted(run: CalibrationRun, probe_m: int, rng: np.random.Generator) -> ModeResult:
@@ -208,7 +198,6 @@ def calibrate_lifted(run: CalibrationRun, probe_m: int, rng: np.random.Generator
         trials.impostors,
         trials.genuine,
         probe_m=probe_m,
-        probe_photos=1,
         norms=honest_norms(trials.foot_norms),
     )
 
@@ -218,9 +207,9 @@ def _calibration(
     impostors: Impostors,
     genuine: Genuine,
     *,
-    probe_m: int,
-    probe_photos: int,
-    norms: tuple[float, float] | None,
+    probe_m: int = 0,
+    probe_photos: int = 1,
+    norms: tuple[float, float] | None = None,
 ) -> ModeResult:
     """Set the levels that the trials resolve."""
     options = run.options
@@ -246,16 +235,17 @@ def _calibration(
             for level in levels
         ]
     everything = len(run.plan.person_of) * (len(run.plan.people) - 1)
+    sample = f"{impostors.trials} of {everything} cross-identity pairs"
+    if probe_photos > 1:
+        sample = f"means of {probe_photos} photos of one person"
+    elif impostors.trials == everything:
+        sample = "all cross-identity pairs"
     facts: dict[str, Json] = {
         **run.facts,
         "genuine_trials": len(genuine.people),
         "impostor_trials": impostors.trials,
         "impostor_people_pairs": impostors.person_pairs,
-        "impostor_sample": "all cross-identity pairs"
-        if impostors.trials == everything and probe_photos == 1
-        else f"{impostors.trials} of {everything} cross-identity pairs"
-        if probe_photos == 1
-        else f"means of {probe_photos} photos of one person",
+        "impostor_sample": sample,
     }
     if folds is not None:
         facts["ten_fold_accuracy"] = folds.accuracy_mean

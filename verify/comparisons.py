@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
 
 from templates.contract import wire
 from templates.contract.levels import photos_in_words
@@ -230,11 +229,8 @@ def lifted_trials(
     keys, repeats = np.unique(pair_people, axis=0, return_counts=True)
     unordered = np.unique(np.sort(keys, axis=1), axis=0)
 
-    shape = (len(plan.people), len(plan.people))
-    counts = csr_array((repeats.astype(np.float64), (keys[:, 0], keys[:, 1])), shape=shape)
-
     def weighted_trials(weights: NDArray[np.float64]) -> float:
-        return float(weights @ np.asarray(counts @ weights))
+        return float(repeats @ (weights[keys[:, 0]] * weights[keys[:, 1]]))
 
     impostors = Impostors(
         scores=np.concatenate(scores),

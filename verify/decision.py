@@ -70,3 +70,22 @@ class Decision:
             liveness="failed",
             liveness_failure=failure,
         )
+
+
+@dataclass(frozen=True)
+class StandIn:
+    """A template of nobody, which no probe is accepted for; decided on as any other.
+
+    Attributes
+    ----------
+    wire
+        Its wire bytes.
+    template_id
+        Any, as long as a real one: a rotation is derived from it, as from a real one.
+    holder_salt
+        None: no key would be the holder's.
+    """
+
+    wire: bytes = field(repr=False)
+    template_id: str = "0" * 32
+    holder_salt: str | None = None

@@ -11,42 +11,20 @@ from pathlib import Path
 from templates.decoys import Attributes
 from verify.datasets import DatasetError
 
-AGES = (
-    "0-2",
-    "3-9",
-    "10-19",
-    "20-29",
-    "30-39",
-    "40-49",
-    "50-59",
-    "60-69",
-    "more than 70",
-)
+AGES = ("0-2", "3-9", "10-19", "20-29", "30-39", "40-49", "50-59", "60-69", "more than 70")
 GENDERS = ("Male", "Female")
 RACES = (
-    "East Asian",
-    "Southeast Asian",
-    "Middle Eastern",
-    "Latino_Hispanic",
-    "Black",
-    "White",
-    "Indian",
+    *("East Asian", "Southeast Asian", "Middle Eastern", "Latino_Hispanic"),
+    *("Black", "White", "Indian"),
 )
 CLASSES = {"gender": GENDERS, "race": RACES, "age": AGES}
 _NEEDED = ("file", "age", "gender", "race")
 _MAX_BYTES = 64 * 2**20
 # 3-9 read as a date is 3 September or 9 March; 10-19 is 19 October or October (20)19.
 _DATES = {
-    "03-sep": "3-9",
-    "3-sep": "3-9",
-    "sep-03": "3-9",
-    "sep-3": "3-9",
-    "09-mar": "3-9",
-    "9-mar": "3-9",
-    "mar-09": "3-9",
-    "mar-9": "3-9",
-    "19-oct": "10-19",
-    "oct-19": "10-19",
+    **dict.fromkeys(("03-sep", "3-sep", "sep-03", "sep-3"), "3-9"),
+    **dict.fromkeys(("09-mar", "9-mar", "mar-09", "mar-9"), "3-9"),
+    **dict.fromkeys(("19-oct", "oct-19"), "10-19"),
 }
 
 

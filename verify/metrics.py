@@ -8,11 +8,10 @@ rounding can move a score across its own threshold.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from statistics import NormalDist
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import csr_array
-from scipy.special import ndtri
 
 from templates.contract.document import Rate
 
@@ -39,7 +38,7 @@ def wilson(errors: float, trials: int, *, confidence: float = 0.95) -> tuple[flo
     """
     if trials == 0:
         return 0.0, 1.0
-    z = float(ndtri(0.5 + confidence / 2))
+    z = NormalDist().inv_cdf(0.5 + confidence / 2)
     p = errors / trials
     centre = p + z * z / (2 * trials)
     spread = z * math.sqrt(p * (1 - p) / trials + (z / (2 * trials)) ** 2)
@@ -193,11 +192,6 @@ def subject_bootstrap(
         )
         first, second = np.divmod(keys, people)
         within = first == second
-        counted = repeats.astype(np.float64)
-        alone = np.bincount(first[within], weights=counted[within], minlength=people)
-        between = csr_array(
-            (counted[~within], (first[~within], second[~within])), shape=(people, people)
-        )
         generator = np.random.default_rng(seed)
         rates = []
         for _ in range(replicates):
@@ -205,7 +199,8 @@ def subject_bootstrap(
             weights = np.bincount(drawn, minlength=people).astype(np.float64)
             total = weighted_trials(weights)
             if total > 0:
-                rates.append(float(weights @ (alone + between @ weights)) / total)
+                each = weights[first] * np.where(within, 1.0, weights[second])
+                rates.append(float(repeats @ each) / total)
         if rates:
             lower, upper = np.percentile(np.clip(rates, 0.0, 1.0), [2.5, 97.5])
             low, high = min(low, float(lower)), max(high, float(upper))

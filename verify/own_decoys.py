@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from templates.decoys import DecoyGenerator, DecoyPool, DecoySource
 from templates.errors import ContractError
-from verify.consistency import impostor_tail
+from verify.consistency import impostor_cosines, impostor_tail
 from verify.evaluation.attributes import resembling_rows
-from verify.raw_pairs import impostor_cosines
 
 LEAST_DEVIATIONS = 4
 """Standard deviations below chance from which on axes correlate too little."""

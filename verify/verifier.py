@@ -2,7 +2,6 @@
 
 import secrets
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -23,9 +22,8 @@ from templates.space.embedding import unit_rows
 from templates.space.subspace import SubspaceBatch, Turn
 from verify.challenge import Movement
 from verify.cohort import Probes, expected_similarity
-from verify.decision import Decision
+from verify.decision import Decision, StandIn
 from verify.photo_probe import MAX_PROBE_PHOTOS, PhotoProbe, probe_of_frames, probe_of_photos
-from verify.stand_ins import StandIn
 
 _NO_SALT = "0" * 32
 
@@ -47,14 +45,6 @@ class OpenedTemplate(Protocol):
     def holder_salt(self) -> str | None:
         """What its holder's rotation is derived from, with their key; None if it needs no key."""
         ...
-
-
-@dataclass(frozen=True)
-class _Rule:
-    """The calibration and level that one decision is taken by."""
-
-    calibration: Calibration
-    level: Level
 
 
 class Verifier:
@@ -194,11 +184,13 @@ class Verifier:
         """
         name = level or self._contract.default_level
         calibration = self._contract.calibration("p2s", probe_photos=photos, level=name)
-        rule = _Rule(calibration, calibration.level(name))
+        threshold = calibration.level(name)
         probe = self._source.project(unit_rows(embedding, n=self._contract.binding.n, most=1))
         template, turn = self._opened(stored, holder_key, read=wire.decode_as_stored)
         turned = turn(probe.astype(np.float64)).astype(np.float32)
-        return self._decide(rule, probe, turned, template, stored, has_key=holder_key is not None)
+        return self._decide(
+            calibration, threshold, probe, turned, template, stored, has_key=holder_key is not None
+        )
 
     def decide_template(
         self,
@@ -230,12 +222,14 @@ class Verifier:
                 f"a lifted probe must have {binding.axes} numbers, not {subspace.n}"
             )
         calibration = self._contract.calibration("s2s", probe_m=subspace.m)
-        rule = _Rule(calibration, calibration.level(level or self._contract.default_level))
+        threshold = calibration.level(level or self._contract.default_level)
         self._require_honest_foot(subspace, calibration)
-        lifted = subspace
         template, turn = self._opened(stored, holder_key, read=wire.decode)
-        turned = lifted.turned_by(turn)
-        return self._decide(rule, lifted, turned, template, stored, has_key=holder_key is not None)
+        turned = subspace.turned_by(turn)
+        return self._decide(
+            calibration, threshold, subspace, turned, template, stored,
+            has_key=holder_key is not None,
+        )  # fmt: skip
 
     def _require_honest_foot(self, subspace: SubspaceBatch, calibration: Calibration) -> None:
         if calibration.foot_point_norm is None:
@@ -275,7 +269,8 @@ class Verifier:
 
     def _decide(
         self,
-        rule: _Rule,
+        calibration: Calibration,
+        level: Level,
         probe: Probes,
         turned: Probes,
         template: SubspaceBatch,
@@ -283,7 +278,6 @@ class Verifier:
         *,
         has_key: bool,
     ) -> Decision:
-        calibration, level = rule.calibration, rule.level
         unknown = isinstance(stored, StandIn)
         distances = paired_distances(
             turned,

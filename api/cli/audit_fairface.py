@@ -20,6 +20,7 @@ from api.cli.options import (
     quick,
     takes_settings,
 )
+from api.cli.results import Plan
 from api.service.opening import file_sealer, open_keyring
 from api.settings import Settings
 from attacks.attributes.attackers import TRAINED
@@ -144,6 +145,7 @@ def fairface(
     _quick: Annotated[
         bool, quick(lifting=300, attack=700, attacked=300, dim="4,16", generated_dim="16,64")
     ] = False,
+    _plan: Plan = None,
     as_json: AsJson = False,
 ) -> None:
     """Infer gender, race and age from templates: the paper's experiment, and stronger attackers.

@@ -21,6 +21,7 @@ from api.cli.options import (
     quick,
     takes_settings,
 )
+from api.cli.results import Plan
 from api.service.opening import file_sealer, open_keyring
 from api.settings import Settings
 from attacks.audit import AuditPlan, run_audit
@@ -154,6 +155,7 @@ def templates(
     _quick: Annotated[
         bool, quick(victims=50, owners=100, climbed=2, attempts=200, training_seconds=20)
     ] = False,
+    _plan: Plan = None,
     as_json: AsJson = False,
 ) -> None:
     """Attack private templates: inversion, linkage, renewal, impersonation, climbing.

@@ -25,6 +25,7 @@ from templates.contract.document import Calibration, Contract
 from templates.distances import Metric
 from templates.space.lifting import Strategy
 from verify import CalibrationOptions, CalibrationReport
+from verify.calibration import SUSPICIOUS_ABOVE
 from verify.evaluation.labels_file import read_labels
 from verify.preparation import acquired, acquired_json
 
@@ -310,7 +311,7 @@ def suspicious_lines(report: CalibrationReport, remedy: str) -> list[str]:
     return [
         f"{count} {'pair of people is' if count == 1 else 'pairs of people are'} suspiciously "
         f"alike (cosine above "
-        f"{report.suspicious_above:g}); look at them, and {remedy}:",
+        f"{SUSPICIOUS_ABOVE:g}); look at them, and {remedy}:",
         *(f"  {_quoted(pair.first)},{_quoted(pair.second)}  {pair.cosine:.3f}" for pair in shown),
         *([f"  and {count - len(shown)} more; see --json"] if count > len(shown) else []),
     ]
@@ -331,7 +332,7 @@ def _report_facts(report: CalibrationReport) -> dict[str, Any]:
         },
         "unresolved": report.unresolved,
         "left_out_of_worst_group": report.left_out,
-        "suspicious_above": report.suspicious_above,
+        "suspicious_above": SUSPICIOUS_ABOVE,
         "suspicious": report.suspicious,
         "ten_fold": [
             {

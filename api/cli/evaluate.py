@@ -19,6 +19,7 @@ from api.cli.evaluation_inputs import (
 from api.cli.evaluation_report import summary, write_results
 from api.cli.inputs import listed, named_file
 from api.cli.options import PROCESSOR, AsJson, Device, chosen_device, quick, takes_settings
+from api.cli.results import Plan
 from api.settings import Settings
 from templates.distances import Metric
 from verify.evaluation.cluster import cluster as dask_cluster
@@ -133,6 +134,7 @@ def evaluate(
     ] = None,
     device: Device = PROCESSOR,
     _quick: Annotated[bool, quick(dim="4,16", metric="spherical", repeats=1)] = False,
+    _plan: Plan = None,
     as_json: AsJson = False,
 ) -> None:
     """Evaluate face verification with private templates: the LFW / CFP / AgeDB protocol.

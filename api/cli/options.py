@@ -55,7 +55,7 @@ def quick(**smaller: Any) -> Any:
 
     def choose(ctx: typer.Context, asked: bool) -> bool:
         if asked:
-            ctx.default_map = smaller
+            ctx.default_map = {**smaller, **(ctx.default_map or {})}
         return asked
 
     said = " ".join(f"--{name.replace('_', '-')} {value}" for name, value in smaller.items())
@@ -98,23 +98,28 @@ def takes_settings(*names: str) -> Callable[[Callable[..., R]], Callable[..., R]
     """
 
     def decorate(command: Callable[..., R]) -> Callable[..., R]:
-        @functools.wraps(command)
         def run(**given: Any) -> R:
             flags = {name: given.pop(name) for name in names}
             with configured_by(given.pop("config")):
                 return command(settings=load_settings(**flags), **given)
 
-        own = [p for p in inspect.signature(command).parameters.values() if p.name != "settings"]
         flags = [_flag(name, Settings.model_fields[name]) for name in names]
-        parameters = [*own, _CONFIG, *flags]
-        keyword_only = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in parameters]
-        # Typer reads these two; the wrapped command would show it the parameter `settings`.
-        run.__signature__ = inspect.Signature(keyword_only)  # type: ignore[attr-defined]
-        run.__annotations__ = {p.name: p.annotation for p in keyword_only}
-        del run.__wrapped__
-        return run
+        return shown_as(run, command, _CONFIG, *flags)
 
     return decorate
+
+
+def shown_as(
+    run: Callable[..., R], command: Callable[..., Any], *added: inspect.Parameter
+) -> Callable[..., R]:
+    """Let Typer show ``run`` with the parameters of ``command``, but ``settings``, and more."""
+    own = [p for p in inspect.signature(command).parameters.values() if p.name != "settings"]
+    parameters = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in (*own, *added)]
+    functools.update_wrapper(run, command)
+    del run.__wrapped__  # type: ignore[attr-defined]
+    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = {p.name: p.annotation for p in parameters}
+    return run
 
 
 @contextmanager

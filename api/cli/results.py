@@ -5,7 +5,6 @@ flags for settings and ``--json``, shows the result, and sets the exit status.
 """
 
 import dataclasses
-import functools
 import inspect
 import json
 import tomllib
@@ -19,7 +18,7 @@ import typer
 
 from api.cli.console import message, print_rich, say
 from api.cli.errors import UsageError
-from api.cli.options import AsJson, takes_settings
+from api.cli.options import AsJson, shown_as, takes_settings
 
 
 @dataclass(frozen=True)
@@ -98,28 +97,21 @@ def _show(table: Table) -> None:
     print_rich(listing)
 
 
+_AS_JSON = inspect.Parameter(
+    "as_json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=AsJson
+)
+
+
 def reports(*settings: str) -> Callable[[Callable[..., Result]], Callable[..., None]]:
     """Give a command that returns a :class:`Result` flags for settings, and ``--json``."""
 
     def decorate(command: Callable[..., Result]) -> Callable[..., None]:
         inner = takes_settings(*settings)(command) if settings else command
 
-        @functools.wraps(command)
         def run(*, as_json: bool, **given: Any) -> None:
             present(inner(**given), json=as_json)
 
-        own = [
-            parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY)
-            for parameter in inspect.signature(inner).parameters.values()
-        ]
-        flag = inspect.Parameter(
-            "as_json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=AsJson
-        )
-        # Typer reads these two; the wrapped command would show it other parameters.
-        run.__signature__ = inspect.Signature([*own, flag])  # type: ignore[attr-defined]
-        run.__annotations__ = {each.name: each.annotation for each in (*own, flag)}
-        del run.__wrapped__
-        return run
+        return shown_as(run, inner, _AS_JSON)
 
     return decorate
 
@@ -132,11 +124,16 @@ def _read_plan(ctx: typer.Context, file: Path | None) -> Path | None:
         values: Mapping[str, Any] = tomllib.loads(file.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise UsageError(f"--plan {file} cannot be read as TOML: {error}") from None
-    values = {name.replace("-", "_"): value for name, value in values.items()}
-    known = {str(each.name) for each in ctx.command.params} - {"plan"}
-    unknown = sorted(set(values) - known)
-    if unknown:
+    names = {
+        flag.lstrip("-").replace("-", "_"): str(parameter.name)
+        for parameter in ctx.command.params
+        for flag in (*parameter.opts, str(parameter.name))
+        if "--plan" not in parameter.opts
+    }
+    chosen = {name.replace("-", "_"): value for name, value in values.items()}
+    if unknown := sorted(chosen.keys() - names.keys()):
         raise UsageError(f"--plan {file} names no option of this command: {', '.join(unknown)}")
+    values = {names[name]: value for name, value in chosen.items()}
     ctx.default_map = {**(ctx.default_map or {}), **values}
     return file
 

@@ -6,10 +6,13 @@ apart by the names of their folders, which is as far as it is seen to here: some
 under two names, with other photos, is not noticed.
 """
 
-import hashlib
-from collections.abc import Collection, Mapping, Sequence
+import random
+from bisect import bisect_left
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import accumulate
 from pathlib import Path
+from typing import TypeVar
 
 from api.cli.decoys import photos_of
 from api.cli.errors import CommandError
@@ -28,6 +31,7 @@ LEAST_PEOPLE = 80
 """With three photos each or more: as many resolve a false match rate of 1 in 1,000."""
 
 Albums = Mapping[str, Sequence[Path]]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -100,38 +104,40 @@ def split_people(albums: Albums) -> tuple[tuple[Path, ...], Albums]:
     """Part people into a sample for the decoys and those to calibrate on.
 
     The sample gets nobody whom the verdict needs, and where nothing else is possible, nobody whom
-    the thresholds need. People with the fewest photos are in it, of equals those whose names hash
-    lowest: the same for the same folder.
+    the thresholds need. People with the fewest photos are in it, of equals any: the same for the
+    same folder.
     """
-
-    def place(name: str) -> tuple[int, bytes]:
-        return len(albums[name]), hashlib.sha256(name.encode("utf-8", "surrogateescape")).digest()
-
-    order = sorted(albums, key=place)
-    for wanted in SAMPLE_PHOTOS:
-        names = _first(order, albums, wanted)
-        rest = _without(albums, names)
-        if names and is_telling(rest):
-            return _photos(albums, names), rest
-    names = _first(order, albums, SAMPLE_PHOTOS[-1])
-    rest = _without(albums, names)
-    if names and with_several(rest) >= LEAST_PEOPLE:
-        return _photos(albums, names), rest
+    order = sorted(_shuffled(albums), key=lambda name: len(albums[name]))
+    photos_so_far = list(accumulate(len(albums[name]) for name in order))
+    tries = [(photos, is_telling) for photos in SAMPLE_PHOTOS]
+    for photos, suffices in [*tries, (SAMPLE_PHOTOS[-1], _sets_thresholds)]:
+        people = bisect_left(photos_so_far, photos) + 1
+        rest = {name: albums[name] for name in order[people:]}
+        # Decoys are adapted to so many people at least.
+        if MIN_DESCRIPTORS // 2 <= people <= len(order) and suffices(rest):
+            return tuple(photo for name in sorted(order[:people]) for photo in albums[name]), rest
     return (), albums
 
 
 def split_faces(faces: Sequence[Path]) -> tuple[tuple[Path, ...], Albums]:
-    """Part faces that nobody labelled: those for decoys, and those to calibrate on, by their names.
+    """Part faces that nobody labelled: those for decoys, and those to calibrate on.
 
-    Each is taken for a person of its own. Which role a face gets depends on its name alone.
+    Each is taken for a person of its own.
     """
-
-    def place(path: Path) -> bytes:
-        return hashlib.sha256(path.name.encode("utf-8", "surrogateescape")).digest()
-
-    order = sorted(faces, key=place)
+    order = _shuffled(faces)
     count = min(CALIBRATED_FACES, len(order) // 2)
     return tuple(sorted(order[count:])), {str(path): (path,) for path in sorted(order[:count])}
+
+
+def _shuffled(things: Iterable[T]) -> list[T]:
+    """Put things in an order of no meaning, the same for the same things."""
+    order = sorted(things, key=str)
+    random.Random(0).shuffle(order)
+    return order
+
+
+def _sets_thresholds(albums: Albums) -> bool:
+    return with_several(albums) >= LEAST_PEOPLE
 
 
 def with_several(albums: Albums) -> int:
@@ -216,24 +222,3 @@ def promises(roles: Roles, *, n: int) -> tuple[list[str], list[str]]:
             f"{FACES_PER_DIMENSION * n:,}"
         )
     return can, cannot
-
-
-def _first(order: Sequence[str], albums: Albums, photos: int) -> list[str]:
-    """The first people who have so many photos together; none where decoys cannot be adapted."""
-    names, count = [], 0
-    for name in order:
-        if count >= photos:
-            break
-        names.append(name)
-        count += len(albums[name])
-    enough = count >= photos and len(names) >= MIN_DESCRIPTORS // 2
-    return names if enough else []
-
-
-def _without(albums: Albums, names: Collection[str]) -> Albums:
-    left = set(names)
-    return {name: photos for name, photos in albums.items() if name not in left}
-
-
-def _photos(albums: Albums, names: Sequence[str]) -> tuple[Path, ...]:
-    return tuple(photo for name in sorted(names) for photo in albums[name])

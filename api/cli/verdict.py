@@ -115,58 +115,20 @@ def improvements(contract: Contract, point: OperatingPoint) -> list[str]:
         )
     if tried:
         lines.append(f"Templates that a thief is expected to find a match for: {tried}.")
-    verdict = contract.verdict
-    if verdict is None:
-        return lines
-    lines += _more_photos(contract)
-    if verdict.privacy.status == "FAIL":
-        lines.append(
-            "To make it private: build the decoys from more photos, of people like these "
-            "(`veilface decoys build … --like PEOPLE`)."
-        )
-    if verdict.accuracy is not None and verdict.accuracy.status == "FAIL":
-        lines.append(
-            "To make it accurate: enroll and verify with more photos; decoys that are more like "
-            "these people allow a smaller dimension."
-        )
-    if verdict.groups is not None and verdict.groups.status == "FAIL":
-        held = any(each.calibrated_on.get("worst_group") for each in contract.calibrations)
-        lines.append(
-            "That group has too few trials for --worst-group to heed it: calibrate on more people "
-            "of it, or put labels into wider ranges."
-            if held
-            else "To hold every group of people to the target: calibrate with --worst-group, at "
-            "the price of more false non-matches."
-        )
-    return lines
-
-
-def _more_photos(contract: Contract) -> list[str]:
-    """Say what photos bought, of an enrollment and of a probe, where accuracy is close."""
-    accuracy = None if contract.verdict is None else contract.verdict.accuracy
-    if accuracy is None or not accuracy.close:
-        return []
-    basis = accuracy.basis
-    rates = {
-        (enrolled, calibration.probe_photos): rate.value
-        for calibration in contract.calibrations
-        if calibration.mode == "p2s"
-        for level in calibration.levels
-        if level.name == contract.default_level
-        for enrolled, rate in (level.frr_by_photos or level.fnmr_by_photos).items()
+    remedies = {
+        "privacy": "To make it private: build the decoys from more photos, of people like these "
+        "(`veilface decoys build … --like PEOPLE`).",
+        "accuracy": "To make it accurate: enroll and verify with more photos; decoys that are more "
+        "like these people allow a smaller dimension.",
+        "groups": "To hold every group of people to the target: calibrate with --worst-group, at "
+        "the price of more false non-matches, on more people of that group.",
     }
-    shown, enrolled = (
-        ", ".join(
-            f"{100 * rate:.3g} % with {pair[which]}"
-            for pair, rate in sorted(rates.items())
-            if pair[1 - which] == basis[other]
-        )
-        for which, other in ((1, "enrolled_photos"), (0, "probe_photos"))
-    )
-    return [
-        f"More photos: of {basis['enrolled_photos']} enrolled, rejected are {shown} shown; of "
-        f"{basis['probe_photos']} shown, {enrolled} enrolled."
+    failed = [
+        name
+        for name in remedies
+        if (judged := getattr(contract.verdict, name, None)) is not None and judged.status == "FAIL"
     ]
+    return lines + [remedies[name] for name in failed]
 
 
 def _not_acquired(accuracy: Judgement) -> str:

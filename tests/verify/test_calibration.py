@@ -300,11 +300,14 @@ def test_excluded_people_are_left_out(people: People) -> None:
     assert facts["people"] == 150 - len(gone)
 
 
-def test_one_person_under_two_names_is_reported_and_can_be_merged() -> None:
+def test_one_person_under_two_names_is_reported_and_can_be_merged(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("verify.calibration.SUSPICIOUS_ABOVE", 0.7)
     people = draw_people(40, photos=(3,), noise=0.3)
     split = ["second name" if i == 0 else name for i, name in enumerate(people.names)]
     source = make_generator()
-    options = CalibrationOptions(targets=(1e-1,), suspicious_above=0.7)
+    options = CalibrationOptions(targets=(1e-1,))
 
     def run(aliases: dict[str, str]) -> Calibrated:
         return calibrate(
