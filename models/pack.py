@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import cv2
 import numpy as np
@@ -14,18 +14,16 @@ from models.alignment import TEMPLATE_NAME, align, template
 from models.boxes import Face, ranked
 from models.decoding import DEFAULT_LIMITS, ImageLimits, decode_image, picture_digest
 from models.demo import DEMO_DIMENSION, is_demo_model, require_face
-from models.detection import DEFAULT_SIZE, Detector, find_faces
+from models.detection import DEFAULT_SIZE, Detector, find_faces, require_upright
+from models.detectors import Scrfd, YuNet
 from models.embedding import Embedder, Preprocessing, normalises_inside
 from models.errors import ImageError, ModelError, PackError
 from models.faces import FaceCrop, FaceSample
 from models.liveness import PassiveLiveness, open_liveness
-from models.orientation import require_upright
 from models.pack_file import PackFile
 from models.pack_graphs import PackGraph, Role, image_size, locate, pick, read_graph
 from models.quality import DEFAULT_QUALITY, Quality, QualityLimits, check, measure
-from models.scrfd import Scrfd
 from models.selection import FacePolicy, select_face
-from models.yunet import YuNet
 
 
 @dataclass(frozen=True)
@@ -60,6 +58,31 @@ class PackInfo:
     embedder_sha256: str
     preprocessing: dict[str, Any]
     detector: DetectorInfo | None
+
+
+class PhotoOptions(TypedDict, total=False):
+    """How a photo becomes a face.
+
+    Attributes
+    ----------
+    policy
+        Which of several faces is meant; ``None`` takes the most central one
+        (`selection.select_face`).
+    quality
+        Limits; ``None`` checks nothing but that there is an upright face.
+    limits
+        What decoding may cost.
+    liveness
+        Also say how live the face looks; the pack needs a liveness graph.
+    digested
+        Also give the digest of the decoded photo.
+    """
+
+    policy: FacePolicy | None
+    quality: QualityLimits | None
+    limits: ImageLimits
+    liveness: bool
+    digested: bool
 
 
 class ModelPack:
@@ -284,16 +307,7 @@ class ModelPack:
             return True
         return quality.score >= self._detector.clear_score
 
-    def embed_photo(
-        self,
-        data: bytes,
-        *,
-        policy: FacePolicy | None = FacePolicy.DOMINANT,
-        quality: QualityLimits | None = DEFAULT_QUALITY,
-        limits: ImageLimits = DEFAULT_LIMITS,
-        liveness: bool = False,
-        digested: bool = False,
-    ) -> FaceSample:
+    def embed_photo(self, data: bytes, **options: Unpack[PhotoOptions]) -> FaceSample:
         """From the bytes of a photo to the embedding of its face.
 
         A pack without a detector takes the photo as an aligned crop: square, resized to the
@@ -302,16 +316,9 @@ class ModelPack:
         Parameters
         ----------
         data
-            JPEG, PNG or WebP.
-        policy
-            Which of several faces is meant; ``None`` takes the most central one
-            (`selection.select_face`).
-        quality
-            Limits; ``None`` checks nothing but that there is an upright face.
-        liveness
-            Also say how live the face looks; the pack needs a liveness graph.
-        digested
-            Also give the digest of the decoded photo.
+            JPEG, PNG, WebP or BMP.
+        options
+            As in `PhotoOptions`; what `crop_photo` takes by default.
 
         Raises
         ------
@@ -324,14 +331,7 @@ class ModelPack:
         ModelError
             If inference fails.
         """
-        taken = self.crop_photo(
-            data,
-            policy=policy,
-            quality=quality,
-            limits=limits,
-            liveness=liveness,
-            digested=digested,
-        )
+        taken = self.crop_photo(data, **options)
         return FaceSample(
             embedding=self.embed(taken.crop[None])[0],
             quality=taken.quality,

@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
 
+from models.detectors import YUNET_OUTPUTS
 from models.errors import PackError
 from models.pack_file import PackFile, read_pack_file
 from models.sessions import Session, Tensor
-from models.yunet import OUTPUTS as YUNET_OUTPUTS
 
 _SUFFIX = ".onnx"
 # A ResNet-100 embedder has 260 MB; protobuf itself ends at 2 GiB.

@@ -1,31 +1,17 @@
 """Several photos of one person, each to the embedding of its face."""
 
 from collections.abc import Sequence
+from typing import Unpack
 
-from models.decoding import DEFAULT_LIMITS, ImageLimits
 from models.errors import ModelError, PhotoRejected
 from models.faces import FaceSample
-from models.pack import ModelPack
-from models.quality import DEFAULT_QUALITY, QualityLimits
-from models.selection import FacePolicy
+from models.pack import ModelPack, PhotoOptions
 
 
 def embed_photos(
-    pack: ModelPack,
-    photos: Sequence[bytes],
-    *,
-    policy: FacePolicy = FacePolicy.DOMINANT,
-    quality: QualityLimits | None = DEFAULT_QUALITY,
-    limits: ImageLimits = DEFAULT_LIMITS,
-    liveness: bool = False,
-    digested: bool = False,
+    pack: ModelPack, photos: Sequence[bytes], **options: Unpack[PhotoOptions]
 ) -> list[FaceSample]:
     """Embed photo files in their order; all or none. A file given twice is embedded once.
-
-    Parameters
-    ----------
-    policy, quality, limits, liveness, digested
-        See ``ModelPack.embed_photo``.
 
     Raises
     ------
@@ -37,14 +23,7 @@ def embed_photos(
         if photo in samples:
             continue
         try:
-            samples[photo] = pack.embed_photo(
-                photo,
-                policy=policy,
-                quality=quality,
-                limits=limits,
-                liveness=liveness,
-                digested=digested,
-            )
+            samples[photo] = pack.embed_photo(photo, **options)
         except ModelError as error:
             raise PhotoRejected(index, error, count=len(photos)) from error
     return [samples[photo] for photo in photos]

@@ -86,7 +86,7 @@ class QualityLimits:
     max_yaw, max_pitch, max_roll
         Absolute degrees.
     min_border, max_aspect
-        As in `Quality`: what `is_partly_hidden` goes by.
+        As in `Quality`: whether part of the face is covered, or lies outside the picture.
     """
 
     min_score: float | None = None
@@ -283,18 +283,14 @@ def check(
         )
 
 
-def is_partly_hidden(quality: Quality, limits: QualityLimits = DEFAULT_QUALITY) -> bool:
-    """Whether part of the face is covered, or lies outside the picture.
+def _hidden(quality: Quality, limits: QualityLimits) -> dict[str, dict[str, float]]:
+    """What says that part of the face is covered, or lies outside the picture.
 
     A detector puts five points on what it sees of a face, as if all of it were there. They then
     reach the border of the picture, and the box, which goes round what is seen, is too narrow for
     its height. A picture that was squeezed has such a box too. What covers a face from above or
     from below leaves the box wide enough.
     """
-    return bool(_hidden(quality, limits))
-
-
-def _hidden(quality: Quality, limits: QualityLimits) -> dict[str, dict[str, float]]:
     hidden = {}
     if quality.border is not None and quality.border < limits.min_border:
         hidden["border"] = _measured(quality.border, limits.min_border)

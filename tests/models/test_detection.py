@@ -9,12 +9,11 @@ from models.alignment import align
 from models.boxes import Face, ranked
 from models.decoding import decode_image
 from models.detection import RETRY_BORDER, canvas_sizes, find_faces, letterbox
+from models.detectors import YUNET_OUTPUTS, Scrfd, YuNet
 from models.errors import ModelError
 from models.pack import ModelPack
-from models.scrfd import Scrfd
 from models.selection import FacePolicy
 from models.sessions import Tensor
-from models.yunet import OUTPUTS, YuNet, _trimmed
 
 STRIDES = (8, 16, 32)
 
@@ -182,13 +181,13 @@ def test_yunet_decodes_centres_and_log_sides():
 
 
 def test_yunet_asks_for_its_outputs_by_name():
-    assert OUTPUTS[:3] == ("cls_8", "cls_16", "cls_32")
-    assert len(OUTPUTS) == 12
+    assert YUNET_OUTPUTS[:3] == ("cls_8", "cls_16", "cls_32")
+    assert len(YUNET_OUTPUTS) == 12
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (250, 250), (40, 4000), (3000, 2000), (641, 640)])
 def test_yunet_canvas_is_whole_blocks_and_bounded(shape):
-    size = _trimmed(np.zeros((*shape, 3), np.uint8), (640, 640))
+    size = YuNet(Replay(None)).canvas(np.zeros((*shape, 3), np.uint8), (640, 640))
     assert all(side % 32 == 0 and 32 <= side <= 640 for side in size)
 
 

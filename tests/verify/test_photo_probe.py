@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 import models.pack
 from models.boxes import Face
 from models.decoding import decode_image
+from models.detectors import Scrfd
 from models.errors import PhotoRejected
 from models.pack import ModelPack
-from models.scrfd import Scrfd
 from templates.contract.document import Contract, LivenessCalibration
 from templates.errors import Uncalibrated
 from tests.api.deployment import RATE, make_contract, make_source

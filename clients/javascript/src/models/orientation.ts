@@ -1,4 +1,4 @@
-/** Which way up a photo is: as in `models/orientation.py`, where the reasons stand. */
+/** Which way up a photo is: as in `models/detection.py`, where the reasons stand. */
 
 import { PhotoError } from "../errors.js";
 import type { Detector, Size } from "./detection.js";
