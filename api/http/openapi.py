@@ -103,11 +103,19 @@ def body_of(
     """Document a body by its models: FastAPI cannot say that a call takes two content types."""
     models = {"multipart/form-data": form, "application/json": json}
     content = {
-        kind: {"schema": model.model_json_schema()}
-        for kind, model in models.items()
-        if model is not None
+        kind: {"schema": _schema_of(model)} for kind, model in models.items() if model is not None
     }
     return {"requestBody": {"required": True, "content": content}}
+
+
+def _schema_of(model: type[BaseModel]) -> dict[str, Any]:
+    """Return a model's schema with its definitions in place: OpenAPI has no room for them here."""
+    schema = model.model_json_schema()
+    definitions = schema.pop("$defs", {})
+    for member in schema["properties"].values():
+        name = member.pop("$ref", "").removeprefix("#/$defs/")
+        member.update({**definitions.get(name, {}), **member})
+    return schema
 
 
 def allowed_methods(document: Mapping[str, Any], path: str) -> list[str]:
