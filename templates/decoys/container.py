@@ -11,7 +11,7 @@ from collections.abc import Mapping
 import numpy as np
 import safetensors
 from numpy.typing import NDArray
-from safetensors.numpy import save
+from safetensors.numpy import load, save
 
 from templates.errors import DecoyError
 
@@ -20,8 +20,6 @@ METADATA_KEY = "veilface"
 
 MAX_HEADER = 64 * 1024
 _LENGTH_BYTES = 8
-_DTYPES: Mapping[str, np.dtype] = {"F32": np.dtype("<f4"), "U8": np.dtype("u1")}
-_MAX_RANK = 3
 
 Fields = Mapping[str, str | int | list[str]]
 
@@ -63,8 +61,8 @@ def decode(
     Returns
     -------
     tuple
-        The fields and the arrays (read-only views of `data`), exactly as `encode` was given them.
-        The caller checks names, shapes and values.
+        The fields and the arrays, exactly as `encode` was given them. The caller checks names,
+        types, shapes and values.
 
     Raises
     ------
@@ -83,9 +81,8 @@ def decode(
         )
     try:
         header = json.loads(data[_LENGTH_BYTES : _LENGTH_BYTES + header_size])
-        fields = json.loads(header.pop("__metadata__")[METADATA_KEY])
-        body = memoryview(data)[_LENGTH_BYTES + header_size :]
-        arrays = {str(name): _array(entry, body) for name, entry in header.items()}
+        fields = json.loads(header["__metadata__"][METADATA_KEY])
+        arrays = load(data)
         canonical = isinstance(fields, dict) and encode(fields, arrays) == data
     except (
         ValueError,
@@ -101,22 +98,3 @@ def decode(
     if not canonical:
         raise DecoyError(f"the {what} is not in its canonical encoding; write it again")
     return fields, arrays
-
-
-def _array(entry: dict[str, object], body: memoryview) -> NDArray[np.generic]:
-    """One tensor as a view of `body`; raises ValueError or KeyError when the entry is wrong."""
-    shape, offsets = entry["shape"], entry["data_offsets"]
-    dtype = _DTYPES[str(entry["dtype"])]
-    if not isinstance(shape, list) or not isinstance(offsets, list):
-        raise ValueError("lists expected")
-    if not 1 <= len(shape) <= _MAX_RANK or not all(
-        type(x) is int and 0 <= x <= len(body) for x in (*shape, *offsets)
-    ):
-        raise ValueError("plain non-negative integers within the file expected")
-    start, stop = offsets
-    count = 1
-    for size in shape:
-        count *= size
-    if stop - start != count * dtype.itemsize:
-        raise ValueError("offsets do not fit the shape")
-    return np.frombuffer(body[start:stop], dtype=dtype).reshape(shape)

@@ -320,22 +320,24 @@ class DecoyPool:
         if fields.get("format") != _FORMAT or fields.get("version") != _VERSION:
             raise DecoyError(f"this is not a decoy pool of version {_VERSION}")
         made_with = take_made_with(fields)
-        names = set(arrays)
-        if names == {"descriptors"} and set(fields) == {"format", "version"}:
-            return cls(arrays["descriptors"].astype(np.float32), made_with=made_with)
-        if names != {"descriptors", "gender", "race"} or set(fields) != {
-            "format",
-            "version",
-            "genders",
-            "races",
-        }:
-            raise DecoyError("the decoy pool has missing or unknown parts")
-        genders = _decoded(fields["genders"], arrays["gender"])
-        races = _decoded(fields["races"], arrays["race"])
-        if len(genders) != len(races):
-            raise DecoyError("the decoy pool has labels of different lengths")
-        labels = [Attributes(g, r) for g, r in zip(genders, races, strict=True)]
-        return cls(arrays["descriptors"].astype(np.float32), labels=labels, made_with=made_with)
+        try:
+            descriptors, labels = arrays.pop("descriptors"), None
+            if arrays:
+                names = [[*fields.pop(part)] for part in ("genders", "races")]  # type: ignore[misc]
+                codes = [arrays.pop(part).tolist() for part in ("gender", "race")]
+                labels = [
+                    Attributes(*(_named(*pair) for pair in zip(names, entry, strict=True)))
+                    for entry in zip(*codes, strict=True)
+                ]
+            if arrays or set(fields) != {"format", "version"} or descriptors.dtype != np.float32:
+                raise ValueError("more, or other parts")
+        except (KeyError, ValueError, TypeError, IndexError):
+            raise DecoyError("the decoy pool has missing or unknown parts") from None
+        return cls(descriptors.astype(np.float32), labels=labels, made_with=made_with)
+
+
+def _named(names: list[str], code: int) -> str | None:
+    return None if code == _UNKNOWN else str(names[code])
 
 
 def _differs(label: Attributes, subject: Attributes) -> bool:
@@ -354,15 +356,3 @@ def _coded(values: list[str | None]) -> tuple[list[str], NDArray[np.uint8]]:
     place: dict[str | None, int] = {name: i for i, name in enumerate(names)}
     place[None] = _UNKNOWN
     return names, np.array([place[value] for value in values], dtype=np.uint8)
-
-
-def _decoded(names: object, codes: NDArray[np.generic]) -> list[str | None]:
-    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise DecoyError("the decoy pool has label names that are not text")
-    if codes.dtype != np.uint8 or codes.ndim != 1:
-        raise DecoyError("the decoy pool has labels of the wrong shape")
-    table: dict[int, str | None] = {**dict(enumerate(names[:_UNKNOWN])), _UNKNOWN: None}
-    try:
-        return [table[code] for code in codes.tolist()]
-    except KeyError:
-        raise DecoyError("the decoy pool has a label without a name") from None
