@@ -10,21 +10,16 @@ first line. So anybody who has the public key of the deployment's receipts can c
 the anchors of one archive after another, and of the log, show that none is missing.
 """
 
-import base64
 import hashlib
 import json
-from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, timedelta
 from pathlib import Path
 from typing import Any
 
 import sqlalchemy as sa
-from cryptography.exceptions import InvalidSignature
-from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 from sqlalchemy.engine import Connection
 
-from templates.contract.canonical import canonical_json
 from templates.errors import StoreError
 from templates.keys.private_file import create_private
 from templates.store.audit_chain import (
@@ -38,6 +33,7 @@ from templates.store.audit_chain import (
 )
 from templates.store.audit_log import By, Entry
 from templates.store.context import StoreContext
+from templates.store.receipts import Receipt, sign_claims, verify_claims
 from templates.store.schema import AuditRow
 from templates.store.secrets import SecretName
 
@@ -135,9 +131,7 @@ def write_archive(
         "lines": len(texts),
         "sha256": hashlib.sha256(body).hexdigest(),
     }
-    private = Ed25519PrivateKey.from_private_bytes(context.secrets.get(SecretName.RECEIPT))
-    signed = canonical_json(claims)
-    first = {"body": signed.decode(), "signature": _text(private.sign(signed))}
+    first = sign_claims(claims, context.secrets.get(SecretName.RECEIPT)).to_json()
     try:
         create_private(file, json.dumps(first).encode() + b"\n" + body)
     except OSError as error:
@@ -162,22 +156,14 @@ def verify_archive(file: Path, public_key: bytes) -> Archive:
     """
     try:
         first, _, lines = file.read_bytes().partition(b"\n")
-        signed: Mapping[str, str] = json.loads(first)
-        body = signed["body"].encode()
-        signature = base64.b64decode(signed["signature"], validate=True)
-        Ed25519PublicKey.from_public_bytes(public_key).verify(signature, body)
-        claims = json.loads(body)
+        claims = verify_claims(Receipt.from_json(json.loads(first)), public_key)
         if claims["kind"] != KIND or hashlib.sha256(lines).hexdigest() != claims["sha256"]:
             raise ValueError
         base, last = Anchor.parse(claims["base"]), Anchor.parse(claims["last"])
     except OSError as error:
         raise StoreError(f"the archive {file} cannot be read: {error.strerror}") from None
-    except (InvalidSignature, ValueError, KeyError, TypeError, AttributeError):
+    except (StoreError, ValueError, KeyError, TypeError):
         raise StoreError(
             f"{file} is no archive of this deployment's audit log, or was altered"
         ) from None
     return Archive(base, last, claims["lines"])
-
-
-def _text(data: bytes) -> str:
-    return base64.b64encode(data).decode()

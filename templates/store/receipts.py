@@ -151,7 +151,7 @@ class ReceiptSigner:
 
 
 def sign_claims(claims: dict[str, Any], private_key: bytes) -> Receipt:
-    """Write the text of a receipt, which names its key, and sign it."""
+    """Write claims as canonical JSON, which names its key, and sign it."""
     private = Ed25519PrivateKey.from_private_bytes(private_key)
     public_key = private.public_key().public_bytes_raw()
     body = canonical_json({**claims, "signing_key": key_fingerprint(public_key)})
@@ -204,27 +204,37 @@ def verify_receipt(receipt: Receipt, public_key: bytes) -> dict[str, Any]:
     StoreError
         If it was not signed with this key, was altered, or is no erasure receipt.
     """
+    claims = verify_claims(receipt, public_key)
+    if claims.get("kind") not in (SUBJECT_KIND, TENANT_KIND) or claims.get("version") != _VERSION:
+        raise StoreError("the signed text is not an erasure receipt of version 1")
+    return claims
+
+
+def verify_claims(signed: Receipt, public_key: bytes) -> dict[str, Any]:
+    """Check the signature of what :func:`sign_claims` signed; return the claims.
+
+    Raises
+    ------
+    StoreError
+        If it was not signed with this key, or was altered.
+    """
     try:
         key = Ed25519PublicKey.from_public_bytes(public_key)
     except ValueError:
         raise StoreError("the public key of a deployment has 32 bytes") from None
     try:
-        key.verify(receipt.signature, receipt.body.encode())
+        key.verify(signed.signature, signed.body.encode())
     except InvalidSignature:
         raise StoreError(
             "the receipt does not carry this deployment's signature: "
             "it was altered, or another deployment signed it"
         ) from None
     try:
-        claims = receipt.claims
+        claims = signed.claims
     except (ValueError, RecursionError):
         raise StoreError("the receipt's body is not JSON") from None
-    if (
-        not isinstance(claims, dict)
-        or claims.get("kind") not in (SUBJECT_KIND, TENANT_KIND)
-        or claims.get("version") != _VERSION
-    ):
-        raise StoreError("the signed text is not an erasure receipt of version 1")
+    if not isinstance(claims, dict):
+        raise StoreError("the receipt's body is no JSON object")
     return claims
 
 
