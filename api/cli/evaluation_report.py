@@ -2,15 +2,15 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
 from rich.table import Table
 
 from api.cli.console import table
 from api.cli.html_report import write_html
 from templates.keys.private_file import replace_public
-from verify.evaluation.markdown_cells import MISSING
+from verify.evaluation.markdown_cells import accuracy, interval_cell, percent
 from verify.evaluation.plan import Json
+from verify.evaluation.row_labels import fmr_targets, strategy_label
 from verify.evaluation.tables import markdown, write_csv
 
 CAPTIONS = {
@@ -41,45 +41,21 @@ def write_results(results: Json, out: Path) -> list[Path]:
 def summary(results: Json, dataset: str) -> Table:
     """Show the rows of one set."""
     rows = [row for row in results["rows"] if row["dataset"] == dataset]
-    targets = list(rows[0]["fnmr_at_fmr"])
+    targets = fmr_targets(rows)
     listing = table(
         f"{dataset}: {rows[0]['n_genuine']} genuine and {rows[0]['n_impostor']} impostor pairs",
-        "strategy",
-        "m",
-        "mode",
-        "metric",
-        "accuracy % ± folds ± seeds",
-        "EER %",
+        *("strategy", "m", "mode", "metric", "accuracy %", "EER %"),
         *(f"FNMR % at FMR {target}" for target in targets),
     )
     for row in rows:
+        grid = " (grid)" if row["threshold_search"] == "grid" else ""
         listing.add_row(
-            _strategy(row),
+            strategy_label(row) + grid,
             str(row["dim"] or ""),
             row["mode"],
             row["metric"],
-            _accuracy(row),
-            f"{100 * row['eer']:.2f}",
-            *(_rate(row["fnmr_at_fmr"][target]) for target in targets),
+            accuracy(row),
+            percent(row["eer"]),
+            *(interval_cell(row["fnmr_at_fmr"][target]) for target in targets),
         )
     return listing
-
-
-def _accuracy(row: Json) -> str:
-    if row["accuracy_mean"] is None:
-        return MISSING
-    text = f"{100 * row['accuracy_mean']:.2f} ± {100 * row['accuracy_std']:.2f}"
-    seeds = row["accuracy_std_seeds"]
-    return text if seeds is None else f"{text} ± {100 * seeds:.2f}"
-
-
-def _strategy(row: Json) -> str:
-    if row["threshold_search"] == "grid":
-        return f"{row['strategy']} (grid)"
-    return (
-        f"{row['strategy']}, generated decoys" if row["decoys"] == "generator" else row["strategy"]
-    )
-
-
-def _rate(at: Any) -> str:
-    return f"{100 * at['value']:.2f} ({100 * at['ci_low']:.2f}-{100 * at['ci_high']:.2f})"
