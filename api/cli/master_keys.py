@@ -2,9 +2,9 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -104,19 +104,18 @@ def renew(
     with opened_store(settings, keyring) as store:
         if is_from_file(settings):
             add_key(settings, store)
-        rewrapped = rewrap_all(settings, keyring, store)
+        done = rewrap_all(settings, keyring, store)
         renewed = store.renew_secrets(archive, by=operator())
-        dropped = retire_older(settings, store, rewrapped) if is_from_file(settings) else 0
+        if is_from_file(settings):
+            done = retire_older(settings, store, done)
         enroll_again = {}
         for tenant in store.tenants.all():
             store.rerotation.begin(tenant.name, by=operator())
             enroll_again[tenant.name] = list(store.rerotation.subjects_of_old_epochs(tenant.name))
-        replace = [key.prefix for key in store.api_keys.all() if key.is_valid_at(utc_now())]
+        api_keys = [key.prefix for key in store.api_keys.all() if key.is_valid_at(utc_now())]
         anchor = str(store.audit_log.head())
     text = [
-        f"Master key {rewrapped.key_id} is in force: {rewrapped.changed} keys and secrets wrapped "
-        f"again, {dropped} older keys dropped.",
-        *(f"Sealed again: {file}" for file in rewrapped.files),
+        *done.text(),
         f"Moved {renewed.archive.lines} lines of the audit log into {archive}; "
         f"{renewed.receipts} receipts signed again.",
         *(
@@ -132,22 +131,22 @@ def renew(
             text.append(f"- Enroll these subjects of tenant {name} again, with new photos:")
         text += [f"    {subject}" for subject in subjects]
         text.append(f"  Then run `veilface keys rotate-tenant --tenant {name} --stolen --finish`.")
-    if replace:
+    if api_keys:
         text.append("- Replace these API keys, and revoke those that nobody knows:")
-    text += [f"    veilface keys replace {prefix} --grace-hours 0" for prefix in replace]
+    text += [f"    veilface keys replace {prefix} --grace-hours 0" for prefix in api_keys]
     if settings.export_key_file is not None:
         text.append("- Make another export key file, if it was stolen too.")
     if not is_from_file(settings):
         text.append("- Drop the older master keys where they come from.")
     text.append("- Destroy copies of the old master key; backups from before can be read with it.")
     facts = {
-        **_facts(rewrapped, dropped),
+        **asdict(done),
         "archived_lines": renewed.archive.lines,
         "receipts_signed_again": renewed.receipts,
         "api_keys_refused": list(renewed.refused),
         "anchor": anchor,
         "enroll_again": enroll_again,
-        "replace_api_keys": replace,
+        "replace_api_keys": api_keys,
     }
     return Result(facts, text)
 
@@ -186,22 +185,20 @@ def add_key(settings: Settings, store: TemplateStore) -> None:
 
 @dataclass(frozen=True)
 class Rewrapped:
-    """What was brought under the current master key.
-
-    Attributes
-    ----------
-    changed
-        Number of keys and secrets that were wrapped again.
-    files
-        Files that were sealed again.
-    is_complete
-        Whether no older key wraps anything any more.
-    """
+    """What was brought under the current master key: keys and secrets, and sealed files."""
 
     key_id: str
-    changed: int
-    files: list[Path]
-    is_complete: bool
+    rewrapped: int
+    resealed_files: list[Path]
+    retired: int = 0
+
+    def text(self) -> list[str]:
+        """Say it in lines."""
+        return [
+            f"Master key {self.key_id} is in force: {self.rewrapped} keys and secrets wrapped "
+            f"again, {self.retired} older keys dropped.",
+            *(f"Sealed again: {file}" for file in self.resealed_files),
+        ]
 
 
 def rewrap_all(settings: Settings, keyring: MasterKeyring, store: TemplateStore) -> Rewrapped:
@@ -209,46 +206,30 @@ def rewrap_all(settings: Settings, keyring: MasterKeyring, store: TemplateStore)
     total = sum(n for key, n in store.wrapped_keys.count().items() if key != keyring.current)
     with progress("wrapping keys again", total) as advance:
         changed = store.wrapped_keys.rewrap(progress=advance)
-    current = keyring.current
-    left = set(store.wrapped_keys.count()) - {current}
-    return Rewrapped(current, changed, _seal_files_again(settings, keyring), not left)
+    return Rewrapped(keyring.current, changed, _seal_files_again(settings, keyring))
 
 
-def retire_older(settings: Settings, store: TemplateStore, rewrapped: Rewrapped) -> int:
-    """Drop the older keys from the key file; returns how many."""
-    if not rewrapped.is_complete:
+def retire_older(settings: Settings, store: TemplateStore, done: Rewrapped) -> Rewrapped:
+    """Drop the older keys from the key file."""
+    if set(store.wrapped_keys.count()) - {done.key_id}:
         raise CommandError(
             "something is still wrapped by an older master key; run `veilface keys rewrap` "
             "again before retiring it"
         )
     path = settings.resolved_master_key_file
-    return store.database.write(lambda _: MasterKeyring.drop_retired(path, keep=rewrapped.key_id))
+    dropped = store.database.write(lambda _: MasterKeyring.drop_retired(path, keep=done.key_id))
+    return replace(done, retired=dropped)
 
 
 def _rewrap(
     settings: Settings, keyring: MasterKeyring, store: TemplateStore, *, retire: bool
 ) -> Result:
-    rewrapped = rewrap_all(settings, keyring, store)
-    dropped = retire_older(settings, store, rewrapped) if retire else 0
-    text = [
-        f"Master key {rewrapped.key_id} is in force: {rewrapped.changed} keys and secrets wrapped "
-        "again.",
-        *(f"Sealed again: {file}" for file in rewrapped.files),
-    ]
-    if dropped:
-        text.append(f"Retired {dropped} older keys.")
-    elif len(keyring.key_ids) > 1:
-        text.append("The older keys are still in the file; `--retire` drops them.")
-    return Result(_facts(rewrapped, dropped), text)
-
-
-def _facts(rewrapped: Rewrapped, dropped: int) -> dict[str, Any]:
-    return {
-        "key_id": rewrapped.key_id,
-        "rewrapped": rewrapped.changed,
-        "resealed_files": rewrapped.files,
-        "retired": dropped,
-    }
+    done = rewrap_all(settings, keyring, store)
+    if retire:
+        done = retire_older(settings, store, done)
+    older = not retire and len(keyring.key_ids) > 1
+    hint = ["The older keys are still in the file; `--retire` drops them."] if older else []
+    return Result(done, [*done.text(), *hint])
 
 
 def _seal_files_again(settings: Settings, keyring: MasterKeyring) -> list[Path]:

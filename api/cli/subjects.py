@@ -25,7 +25,6 @@ from templates.decoys import Attributes
 from templates.keys.holder_key import (
     new_holder_key,
     read_holder_key,
-    wipe,
     write_holder_key,
 )
 from templates.space.agreement import InconsistentImages
@@ -106,10 +105,7 @@ def enroll(
     else:
         holder_key = None if holder_key_file is None else read_holder_key(holder_key_file)
     data = [read_photo(photo, settings.max_image_bytes) for photo in photos]
-    runtime = Runtime.open(settings)
-    try:
-        pack = _required_pack(runtime)
-        name = _tenant(runtime, tenant)
+    with _opened(settings, tenant) as (runtime, pack, name):
         epoch = runtime.epoch(name)
         with _named(photos):
             enrollment = runtime.enroller(name, epoch).from_photos(
@@ -135,11 +131,7 @@ def enroll(
         )
         if (weakness := weak_privacy(runtime.contract)) is not None:
             message(f"warning: weak privacy: {weakness}")
-        binding = runtime.contract.binding
-        notice = demo_notice(binding.embedder_sha256, n=binding.n)
-    finally:
-        wipe(holder_key)
-        runtime.close()
+    notice = demo_notice(pack.info.embedder_sha256, n=pack.info.n)
     done = "Enrolled" if stored.created else "Replaced the enrollment of"
     return Result(
         {
@@ -193,10 +185,7 @@ def verify(
         raise UsageError(f"a verification takes 1 to {MAX_PROBE_PHOTOS} photos, not {len(photos)}")
     holder_key = None if holder_key_file is None else read_holder_key(holder_key_file)
     data = [read_photo(photo, settings.max_image_bytes) for photo in photos]
-    runtime = Runtime.open(settings)
-    try:
-        pack = _required_pack(runtime)
-        name = _tenant(runtime, tenant)
+    with _opened(settings, tenant) as (runtime, pack, name):
         read = runtime.read(name, subject)
         if read is None:
             raise CommandError(f"nobody is enrolled as {subject!r} in tenant {name}")
@@ -216,11 +205,7 @@ def verify(
         runtime.store.audit_log.record(
             Entry("verify-locally", outcome, operator(), name, pseudonym)
         )
-        binding = runtime.contract.binding
-        notice = demo_notice(binding.embedder_sha256, n=binding.n)
-    finally:
-        wipe(holder_key)
-        runtime.close()
+    notice = demo_notice(pack.info.embedder_sha256, n=pack.info.n)
     advice = [] if decision.advice is None else [decision.advice]
     return Result(
         {
@@ -249,15 +234,18 @@ def _named(photos: Sequence[Path]) -> Iterator[None]:
         raise CommandError(error.sentence([photo.name for photo in photos])) from None
 
 
-def _required_pack(runtime: Runtime) -> ModelPack:
-    if runtime.pack is None:
-        raise UsageError("photos need a model pack; name it with --pack")
-    return runtime.pack
+@contextmanager
+def _opened(settings: Settings, tenant: str | None) -> Iterator[tuple[Runtime, ModelPack, str]]:
+    """Open the deployment; with its pack, and the tenant's name.
 
-
-def _tenant(runtime: Runtime, named: str | None) -> str:
-    """Choose the tenant; only the default one is made where it is missing."""
-    name = named or runtime.settings.default_tenant
-    if name == runtime.settings.default_tenant:
-        return runtime.store.tenants.create(name).name
-    return runtime.store.tenants.get(name).name
+    Only the default tenant is made where it is missing.
+    """
+    runtime = Runtime.open(settings)
+    try:
+        if runtime.pack is None:
+            raise UsageError("photos need a model pack; name it with --pack")
+        tenants, name = runtime.store.tenants, tenant or settings.default_tenant
+        known = tenants.create(name) if name == settings.default_tenant else tenants.get(name)
+        yield runtime, runtime.pack, known.name
+    finally:
+        runtime.close()
