@@ -26,7 +26,7 @@ from api.http.context import RequestContext
 from api.http.cors import Cors
 from api.http.deps import refuse_unknown
 from api.http.errors import ApiError, StartError, api_error, wrong_value
-from api.http.openapi import DescribedApi, allowed_methods, describe, operation_id
+from api.http.openapi import ERRORS, DescribedApi, allowed_methods, describe, operation_id
 from api.http.protocol import Protocol
 from api.http.routes import (
     audit_log,
@@ -140,7 +140,9 @@ def _built(*modules: ModuleType) -> tuple[BaseRoute, ...]:
     """
     router = APIRouter(generate_unique_id_function=operation_id)
     for module in modules:
-        router.include_router(module.router, dependencies=[Depends(refuse_unknown)])
+        router.include_router(
+            module.router, dependencies=[Depends(refuse_unknown)], responses=ERRORS
+        )
     for _ in iter_route_contexts(router.routes):
         pass
     return tuple(router.routes)

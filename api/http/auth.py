@@ -1,18 +1,24 @@
 """Who calls, and what they may do: API keys with a tenant and rights, and tokens under them."""
 
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
+from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, Any, TypeVar
 
 from fastapi import Depends, Request, Security
 from fastapi.security import APIKeyHeader, HTTPAuthorizationCredentials, HTTPBearer
 
+from api.http.audit import by
 from api.http.errors import ApiError
 from api.http.tokens import SubjectToken, opened_token, prefix_of
 from api.limits.admission import Gate
 from api.limits.rates import RateLimits
 from api.service.runtime import Runtime
+from models.demo import DEMO_NOTICE
 from templates.keys.api_token import is_token
+from templates.store import TemplateStore
+from templates.store.api_keys import ApiKey
+from templates.store.audit_log import By
 
 _bearer = HTTPBearer(
     auto_error=False, scheme_name="bearer", description="`Authorization: Bearer vf_…`, or `vft_…`"
@@ -21,62 +27,111 @@ _header = APIKeyHeader(
     name="X-API-Key", auto_error=False, scheme_name="apiKey", description="`X-API-Key: vf_…`"
 )
 
+T = TypeVar("T")
+
 
 @dataclass(frozen=True)
-class Caller:
-    """An API key that was recognised, or a token that it asked for.
+class Call:
+    """A call whose API key was recognised, and what answers it.
 
     Attributes
     ----------
-    prefix, tenant, lowest_level
-        Of the API key.
-    key_id
-        Its row's id.
-    rights
-        Of the key. With a token: what it is for, and ``embeddings`` where the key has it.
-    subject_token
-        What the request's token is good for; None where it came with the API key itself.
+    key
+        The API key, or the one that made the token.
+    token
+        What the call's token is good for; None where it came with the API key itself.
     """
 
-    prefix: str
-    tenant: str
-    key_id: str = field(repr=False)
-    rights: frozenset[str]
-    lowest_level: str | None = None
-    subject_token: SubjectToken | None = None
+    request: Request = field(repr=False)
+    key: ApiKey
+    token: SubjectToken | None = None
 
-    def require(self, *rights: str) -> None:
-        """Refuse unless the key has all of these rights.
+    @property
+    def runtime(self) -> Runtime:
+        """What the process opened at its start."""
+        runtime: Runtime = self.request.app.state.runtime
+        return runtime
 
-        Raises
-        ------
-        ApiError
-            ``forbidden``; it names the right that is missing.
-        """
-        missing = [right for right in rights if right not in self.rights]
-        if missing:
-            raise ApiError(
-                "forbidden",
-                f"this API key lacks the right {missing[0]}",
-                {"missing": missing},
-            )
+    @property
+    def store(self) -> TemplateStore:
+        """The database."""
+        return self.runtime.store
+
+    @property
+    def tenant(self) -> str:
+        """The only tenant that the call sees."""
+        return self.key.tenant
+
+    @property
+    def rights(self) -> frozenset[str]:
+        """Rights of the key. With a token: what it is for, and ``embeddings`` if the key has it."""
+        rights = frozenset(map(str, self.key.rights))
+        return rights if self.token is None else rights & {self.token.action, "embeddings"}
 
     @property
     def sees_scores(self) -> bool:
-        """Whether the key may see distances, and why liveness failed."""
+        """Whether the caller may see distances, and why liveness failed."""
         return {"scores", "enroll"} <= self.rights
 
     @property
     def sees_enrollment(self) -> bool:
-        """Whether the key may learn that a subject does not exist."""
+        """Whether the caller may learn that a subject does not exist."""
         return bool(self.rights & {"enroll", "admin"})
 
+    @property
+    def by(self) -> By:
+        """Who asks, for the audit log."""
+        return by(self.request)
 
-async def caller(
+    @property
+    def common(self) -> dict[str, Any]:
+        """What every answer says: the request's id, and with the demo model a notice."""
+        notice = DEMO_NOTICE if self.runtime.settings.demo else None
+        return {"request_id": self.request.state.request_id, "notice": notice}
+
+    def require(self, right: str) -> None:
+        """Refuse unless the caller has this right.
+
+        Raises
+        ------
+        ApiError
+            ``forbidden``.
+        """
+        if right not in self.rights:
+            raise ApiError(
+                "forbidden", f"this API key lacks the right {right}", {"missing": [right]}
+            )
+
+    def note_subject(self, subject: str) -> str:
+        """Keep the subject's pseudonym for the logs; return it."""
+        pseudonym = self.store.signer.pseudonym(self.tenant, subject)
+        self.request.state.pseudonym = pseudonym
+        self.request.state.log["subject"] = pseudonym[:16]
+        return pseudonym
+
+    def place(self) -> AbstractAsyncContextManager[None]:
+        """Take a place for a body, from before it is read until the answer is known."""
+        return self._gate.admitted(self.key.prefix)
+
+    async def query(self, work: Callable[[], T]) -> T:
+        """Run work that asks the database, in a thread."""
+        return await self._gate.query(work)
+
+    async def compute(self, work: Callable[[], T]) -> T:
+        """Run work in a thread, once it is this key's turn to compute."""
+        return await self._gate.compute(work, key=self.key.prefix)
+
+    @property
+    def _gate(self) -> Gate:
+        gate: Gate = self.request.app.state.gate
+        return gate
+
+
+async def call_of(
     request: Request,
     bearer: Annotated[HTTPAuthorizationCredentials | None, Security(_bearer)] = None,
     header: Annotated[str | None, Security(_header)] = None,
-) -> Caller:
+) -> Call:
     """Recognise the API key of a request, or a token, which counts for the key that made it.
 
     Raises
@@ -93,22 +148,22 @@ async def caller(
     # What is neither a key nor a token costs no query.
     if text is None or not (is_token(text) or prefix_of(text)):
         raise _unauthorized()
-    known = await gate.query(lambda: _recognised(runtime, text))
-    if known is None:
+    key, token = await gate.query(lambda: _recognised(runtime, text))
+    if key is None:
         raise _unauthorized()
-    request.state.log.update(tenant=known.tenant, key_id=known.prefix)
-    token = known.subject_token
+    call = Call(request, key, token)
+    request.state.log.update(tenant=key.tenant, key_id=key.prefix)
     if token is not None:
         request.state.log["token_id"] = token.token_id
-        note_subject(request, known, token.subject)
+        call.note_subject(token.subject)
         # Before it counts: who finds an old token shall not use up the rate of its key.
         token.require_in_time()
     rate_limits: RateLimits = request.app.state.rate_limits
-    await rate_limits.count_key(known.prefix)
+    await rate_limits.count_key(key.prefix)
     if token is not None:
         token.require(request.scope["route"].name, request.path_params.get("subject_id"))
         await gate.query(lambda: runtime.store.audit_log.require_unused(token.digest))
-    return known
+    return call
 
 
 def _unauthorized() -> ApiError:
@@ -120,47 +175,49 @@ def _unauthorized() -> ApiError:
     )
 
 
-def _recognised(runtime: Runtime, text: str) -> Caller | None:
-    """Look up an API key, or that of a token."""
-    prefix, token = prefix_of(text), None
+def _recognised(runtime: Runtime, text: str) -> tuple[ApiKey | None, SubjectToken | None]:
+    """Look up an API key, or a token with the key that made it."""
+    keys, prefix = runtime.store.api_keys, prefix_of(text)
     if prefix is None:
-        key = runtime.store.api_keys.verify(text)
-    else:
-        key = runtime.store.api_keys.valid(prefix)
-        token = None if key is None else opened_token(runtime.keyring, text, key_id=key.id)
-        if key is None or token is None:
-            return None
-        if not token.late:
-            runtime.store.api_keys.note_use(key)
-    if key is None:
-        return None
-    rights = frozenset(map(str, key.rights))
-    return Caller(
-        prefix=key.prefix,
-        tenant=key.tenant,
-        key_id=key.id,
-        rights=rights if token is None else rights & {token.action, "embeddings"},
-        lowest_level=key.lowest_level,
-        subject_token=token,
-    )
+        return keys.verify(text), None
+    key = keys.valid(prefix)
+    token = None if key is None else opened_token(runtime.keyring, text, key_id=key.id)
+    if key is None or token is None:
+        return None, None
+    keys.note_use(key)
+    return key, token
 
 
-def note_subject(request: Request, caller: Caller, subject: str) -> None:
-    """Keep the subject's pseudonym for the audit log, and its beginning for the request's line."""
-    runtime: Runtime = request.app.state.runtime
-    pseudonym = runtime.store.signer.pseudonym(caller.tenant, subject)
-    request.state.pseudonym = pseudonym
-    request.state.log["subject"] = pseudonym[:16]
+AnyCall = Annotated[Call, Depends(call_of)]
 
 
-CallerDep = Annotated[Caller, Depends(caller)]
+@dataclass(frozen=True)
+class Holding:
+    """A dependency that demands one of some rights, before anything of the body is read."""
+
+    rights: tuple[str, ...]
+
+    async def __call__(self, call: AnyCall) -> Call:
+        """Return the call.
+
+        Raises
+        ------
+        ApiError
+            ``forbidden``; it names the rights.
+        """
+        if not call.rights & {*self.rights}:
+            raise ApiError(
+                "forbidden",
+                f"this API key lacks the right {' or '.join(self.rights)}",
+                {"missing": list(self.rights)},
+            )
+        return call
 
 
-def holding(*rights: str) -> Callable[[Caller], Awaitable[Caller]]:
-    """Make a dependency that demands rights before anything of the body is read."""
-
-    async def holder(caller: CallerDep) -> Caller:
-        caller.require(*rights)
-        return caller
-
-    return holder
+Enrolls = Annotated[Call, Depends(Holding(("enroll",)))]
+Verifies = Annotated[Call, Depends(Holding(("verify",)))]
+EnrollsOrVerifies = Annotated[Call, Depends(Holding(("enroll", "verify")))]
+Erases = Annotated[Call, Depends(Holding(("erase",)))]
+Exports = Annotated[Call, Depends(Holding(("export",)))]
+Administers = Annotated[Call, Depends(Holding(("admin",)))]
+Lifts = Annotated[Call, Depends(Holding(("embeddings",)))]

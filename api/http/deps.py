@@ -1,42 +1,20 @@
-"""Dependencies of the routes, as annotated aliases."""
+"""Parameters that several routes take, as annotated aliases, and what none of them takes."""
 
 import re
-from typing import Annotated, Any
+from typing import Annotated
 from urllib.parse import parse_qsl
 
 from fastapi import Depends, Header, Path, Query, Request
 from pydantic import BeforeValidator
 
-from api.http.auth import Caller, CallerDep, holding, note_subject
+from api.http.auth import AnyCall
 from api.http.errors import ApiError, refuse_unknown_names
-from api.limits.admission import Gate
-from api.service.runtime import Runtime
-from models.demo import DEMO_NOTICE
 from templates.store.identifiers import SUBJECT_ID_RULE, checked_subject_id
 from templates.store.subjects import Precondition
 
 
-async def runtime_of(request: Request) -> Runtime:
-    """Return what the process opened at its start."""
-    runtime: Runtime = request.app.state.runtime
-    return runtime
-
-
-async def gate_of(request: Request) -> Gate:
-    """Return what bounds the process's work."""
-    gate: Gate = request.app.state.gate
-    return gate
-
-
-async def common_of(request: Request) -> dict[str, Any]:
-    """Return what every answer says: the request's id, and with the demo model a notice."""
-    demo = request.app.state.settings.demo
-    return {"request_id": request.state.request_id, "notice": DEMO_NOTICE if demo else None}
-
-
 async def subject_of(
-    request: Request,
-    caller: CallerDep,
+    call: AnyCall,
     subject_id: Annotated[
         str, Path(description=f"Subject id: has {SUBJECT_ID_RULE}.", examples=["alice"])
     ],
@@ -48,25 +26,8 @@ async def subject_of(
     InvalidIdentifier
         If it breaks the rule.
     """
-    note_subject(request, caller, checked_subject_id(subject_id))
+    call.note_subject(checked_subject_id(subject_id))
     return subject_id
-
-
-async def enrolls_or_verifies(caller: CallerDep) -> Caller:
-    """Demand one of the rights to send a photo, or a token for a browser that will.
-
-    Raises
-    ------
-    ApiError
-        ``forbidden``.
-    """
-    if not caller.rights & {"enroll", "verify"}:
-        raise ApiError(
-            "forbidden",
-            "this API key lacks the rights enroll and verify, and one of them is needed",
-            {"missing": ["enroll", "verify"]},
-        )
-    return caller
 
 
 async def refuse_unknown(request: Request) -> None:
@@ -169,15 +130,6 @@ Limit = Annotated[
     int, BeforeValidator(_digits), Query(ge=1, le=1000, description="Entries on one page, at most.")
 ]
 Cursor = Annotated[str | None, Query(description="`next_cursor` of the page before.")]
-RuntimeDep = Annotated[Runtime, Depends(runtime_of)]
-GateDep = Annotated[Gate, Depends(gate_of)]
-Common = Annotated[dict[str, Any], Depends(common_of)]
 SubjectDep = Annotated[str, Depends(subject_of)]
 PreconditionDep = Annotated[Precondition | None, Depends(precondition_of)]
 NoPreconditionDep = Annotated[None, Depends(refuse_precondition)]
-Enrolls = Annotated[Caller, Depends(holding("enroll"))]
-EnrollsOrVerifies = Annotated[Caller, Depends(enrolls_or_verifies)]
-Verifies = Annotated[Caller, Depends(holding("verify"))]
-Erases = Annotated[Caller, Depends(holding("erase"))]
-Administers = Annotated[Caller, Depends(holding("admin"))]
-Exports = Annotated[Caller, Depends(holding("export"))]

@@ -11,7 +11,7 @@ from pydantic import BaseModel
 from starlette.routing import BaseRoute
 
 from api.http.errors import ERROR_CODES
-from api.http.schemas import REQUEST_ID, ErrorAnswer
+from api.http.schemas import ErrorAnswer
 
 DESCRIPTION = """\
 Face authentication that never stores a face embedding. Every error has one shape; the codes are
@@ -26,26 +26,10 @@ TAGS = (
 )
 """Groups of calls, in the order of the reference."""
 
-EVERY_CALL = (
-    "unauthorized",
-    "rate_limited",
-    "store_unavailable",
-    "overloaded",
-    "internal_error",
-)
-BODY = ("malformed_request", "request_too_large", "validation_failed")
-PHOTO = (
-    "unsupported_image",
-    "image_too_large",
-    "too_many_images",
-    "no_face",
-    "multiple_faces",
-    "face_too_small",
-    "low_quality",
-    "model_unavailable",
-)
-
-CHECKED_PHOTO = ("unsupported_image", "image_too_large", "too_many_images", "model_unavailable")
+ERRORS: dict[int | str, dict[str, Any]] = {
+    "default": {"model": ErrorAnswer, "description": "An error, by its code."}
+}
+"""What every call may answer."""
 
 
 class DescribedApi(FastAPI):
@@ -71,30 +55,6 @@ def describe(routes: Sequence[BaseRoute], *, version: str) -> dict[str, Any]:
     return get_openapi(
         title="Veilface", version=version, description=DESCRIPTION, tags=[*TAGS], routes=routes
     )
-
-
-def error_responses(*codes: str) -> dict[int | str, dict[str, Any]]:
-    """Document the codes of one call, grouped by status, each with an example."""
-    grouped: dict[int | str, dict[str, Any]] = {}
-    for code in sorted(set(codes), key=list(ERROR_CODES).index):
-        entry = ERROR_CODES[code]
-        response = grouped.setdefault(
-            entry.status,
-            {
-                "model": ErrorAnswer,
-                "description": "",
-                "content": {"application/json": {"examples": {}}},
-            },
-        )
-        shown = f"`{code}`: {entry.meaning}"
-        response["description"] = "\n\n".join(filter(None, (response["description"], shown)))
-        response["content"]["application/json"]["examples"][code] = {
-            "value": {
-                "error": {"code": code, "message": entry.meaning, "details": {}},
-                "request_id": REQUEST_ID,
-            }
-        }
-    return grouped
 
 
 def body_of(

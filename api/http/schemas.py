@@ -5,6 +5,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, PlainSerializer
 
+from api.http.errors import ERROR_CODES
 from templates.store.api_keys import Right
 from verify import Movement
 from verify.challenge import LivenessFailure
@@ -42,7 +43,7 @@ class _Answer(_Shape):
 class ErrorBody(_Shape):
     """What went wrong."""
 
-    code: str = Field(examples=["no_face"])
+    code: str = Field(examples=["no_face"], json_schema_extra={"enum": list(ERROR_CODES)})
     message: str = Field(examples=["no face was found in the photo"])
     details: dict[str, Any]
 

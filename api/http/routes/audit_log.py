@@ -2,11 +2,10 @@
 
 from typing import Annotated
 
-from fastapi import APIRouter, Query, Request
+from fastapi import APIRouter, Query
 
-from api.http.auth import note_subject
-from api.http.deps import Administers, Common, Cursor, GateDep, Limit, RuntimeDep
-from api.http.openapi import EVERY_CALL, error_responses
+from api.http.auth import Administers
+from api.http.deps import Cursor, Limit
 from api.http.schemas import AuditLine, AuditLogAnswer
 from templates.store.cursors import close_cursor, open_cursor
 from templates.store.identifiers import checked_subject_id
@@ -16,17 +15,9 @@ router = APIRouter(prefix="/v1/audit-log", tags=["Operations"])
 _CURSOR_PURPOSE = "audit-log-cursor"
 
 
-@router.get(
-    "",
-    responses=error_responses(*EVERY_CALL, "forbidden", "validation_failed"),
-    summary="The tenant's audit log, page by page",
-)
+@router.get("", summary="The tenant's audit log, page by page")
 async def get_audit_log(
-    request: Request,
-    caller: Administers,
-    runtime: RuntimeDep,
-    gate: GateDep,
-    common: Common,
+    call: Administers,
     limit: Limit = 100,
     cursor: Cursor = None,
     subject_id: Annotated[str | None, Query(description="Only lines on this subject.")] = None,
@@ -36,20 +27,20 @@ async def get_audit_log(
     Whether a line was altered, removed or moved takes the whole log to see, and
     `veilface audit-log verify`.
     """
-    store, keyring, tenant = runtime.store, runtime.keyring, caller.tenant
+    keyring, pseudonym = call.runtime.keyring, None
     if subject_id is not None:
-        note_subject(request, caller, checked_subject_id(subject_id))
+        pseudonym = call.note_subject(checked_subject_id(subject_id))
 
     def work() -> AuditLogAnswer:
         before = None
         if cursor is not None:
-            before = int(open_cursor(keyring, cursor, purpose=_CURSOR_PURPOSE, tenant=tenant))
-        pseudonym = None if subject_id is None else store.signer.pseudonym(tenant, subject_id)
-        lines, earlier = store.audit_log.page(
-            tenant, limit=limit, before=before, pseudonym=pseudonym
+            opened = open_cursor(keyring, cursor, purpose=_CURSOR_PURPOSE, tenant=call.tenant)
+            before = int(opened)
+        lines, earlier = call.store.audit_log.page(
+            call.tenant, limit=limit, before=before, pseudonym=pseudonym
         )
         return AuditLogAnswer(
-            **common,
+            **call.common,
             # Without its number, which would tell how much the other tenants do.
             lines=[
                 AuditLine(
@@ -65,7 +56,7 @@ async def get_audit_log(
             ],
             next_cursor=None
             if earlier is None
-            else close_cursor(keyring, str(earlier), purpose=_CURSOR_PURPOSE, tenant=tenant),
+            else close_cursor(keyring, str(earlier), purpose=_CURSOR_PURPOSE, tenant=call.tenant),
         )
 
-    return await gate.query(work)
+    return await call.query(work)

@@ -1,11 +1,11 @@
 """A challenge of head movements, for one attempt."""
 
-from fastapi import APIRouter, Request
+from fastapi import APIRouter
 
+from api.http.auth import Verifies
 from api.http.bodies import read_json
 from api.http.challenges import new_challenge
-from api.http.deps import Common, GateDep, RuntimeDep, Verifies
-from api.http.openapi import BODY, EVERY_CALL, body_of, error_responses
+from api.http.openapi import body_of
 from api.http.requests import ChallengeJson
 from api.http.schemas import ChallengeAnswer
 from verify import MAX_FRAMES, MIN_FRAMES
@@ -15,13 +15,10 @@ router = APIRouter(prefix="/v1/challenges", tags=["Enroll and verify"])
 
 @router.post(
     "",
-    responses=error_responses(*EVERY_CALL, *BODY, "forbidden", "not_found", "replayed"),
     openapi_extra=body_of(json=ChallengeJson),
     summary="Ask for a challenge of head movements",
 )
-async def create_challenge(
-    request: Request, caller: Verifies, runtime: RuntimeDep, gate: GateDep, common: Common
-) -> ChallengeAnswer:
+async def create_challenge(call: Verifies) -> ChallengeAnswer:
     """Right: `verify`. It is good for one verification, of the subject if one is named.
 
     The frames of a person who makes the movements in this order go to the verification as
@@ -30,21 +27,22 @@ async def create_challenge(
     With a token it is for the token's subject, and answered with the same token; it does not use
     the token up.
     """
-    async with gate.admitted(caller.prefix):
-        subject = (await read_json(request, runtime.settings, ChallengeJson)).subject_id
-    if caller.subject_token is not None:
-        caller.subject_token.require("create_challenge", subject)
-        subject = caller.subject_token.subject
-    runtime.liveness.require_challenges()
+    async with call.place():
+        sent = await read_json(call.request, call.runtime.settings, ChallengeJson)
+    subject = sent.subject_id
+    if call.token is not None:
+        call.token.require("create_challenge", subject)
+        subject = call.token.subject
+    call.runtime.liveness.require_challenges()
     challenge_id, challenge = new_challenge(
-        runtime.keyring,
-        tenant=caller.tenant,
-        key_prefix=caller.prefix,
+        call.runtime.keyring,
+        tenant=call.tenant,
+        key_prefix=call.key.prefix,
         subject=subject,
-        token=caller.subject_token,
+        token=call.token,
     )
     return ChallengeAnswer(
-        **common,
+        **call.common,
         challenge_id=challenge_id,
         movements=list(challenge.movements),
         min_frames=MIN_FRAMES,

@@ -2,13 +2,11 @@
 
 from typing import Any
 
-from fastapi import APIRouter, Depends, Request, Response
+from fastapi import APIRouter, Response
 
 from api.http.answers import has_copy
-from api.http.auth import CallerDep, holding
-from api.http.deps import Common, GateDep, RuntimeDep
+from api.http.auth import AnyCall, Lifts
 from api.http.errors import ApiError
-from api.http.openapi import EVERY_CALL, error_responses
 from api.http.receipts import receipt_key_json
 from api.http.schemas import ContractAnswer, ReceiptKey
 from templates.decoys import DecoyGenerator
@@ -16,30 +14,24 @@ from templates.decoys import DecoyGenerator
 router = APIRouter(prefix="/v1/contract", tags=["Operations"])
 
 
-@router.get(
-    "",
-    responses=error_responses(*EVERY_CALL, "replayed"),
-    summary="The contract and its security levels",
-)
-async def get_contract(
-    caller: CallerDep, runtime: RuntimeDep, gate: GateDep, common: Common
-) -> ContractAnswer:
+@router.get("", summary="The contract and its security levels")
+async def get_contract(call: AnyCall) -> ContractAnswer:
     """Right: any. What the contract seals is not part of it."""
-    tenant = await gate.query(lambda: runtime.store.tenants.get(caller.tenant))
+    runtime = call.runtime
+    tenant = await call.query(lambda: call.store.tenants.get(call.tenant))
     public: dict[str, Any] = runtime.contract.public()
     return ContractAnswer(
-        **common,
+        **call.common,
         **public,
         photos=runtime.pack is not None,
         generator=isinstance(runtime.source, DecoyGenerator),
         template_enrollment=tenant.template_enrollment,
-        receipt_key=ReceiptKey(**receipt_key_json(runtime.store.signer.public_key())),
+        receipt_key=ReceiptKey(**receipt_key_json(call.store.signer.public_key())),
     )
 
 
 @router.get(
     "/generator",
-    dependencies=[Depends(holding("embeddings"))],
     response_class=Response,
     responses={
         200: {
@@ -50,16 +42,15 @@ async def get_contract(
             },
         },
         304: {"description": "The client's copy is the same."},
-        **error_responses(*EVERY_CALL, "forbidden", "not_found", "replayed"),
     },
     summary="The decoy generator, for clients that lift",
 )
-async def get_generator(request: Request, runtime: RuntimeDep, gate: GateDep) -> Response:
+async def get_generator(call: Lifts) -> Response:
     """Right: `embeddings`. A pool of real descriptors is never given away.
 
     A client may keep it, and asks each time whether it still holds.
     """
-    source = runtime.source
+    source = call.runtime.source
     if not isinstance(source, DecoyGenerator):
         raise ApiError(
             "not_found",
@@ -71,8 +62,8 @@ async def get_generator(request: Request, runtime: RuntimeDep, gate: GateDep) ->
         # The path does not name the content. And whoever uses a copy must still have the right.
         "Cache-Control": "private, no-cache",
     }
-    if has_copy(request, headers["ETag"]):
+    if has_copy(call.request, headers["ETag"]):
         return Response(status_code=304, headers=headers)
     return Response(
-        await gate.query(source.to_bytes), media_type="application/octet-stream", headers=headers
+        await call.query(source.to_bytes), media_type="application/octet-stream", headers=headers
     )

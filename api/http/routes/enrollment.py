@@ -1,19 +1,11 @@
 """Enrollment: photos, or a client's template."""
 
-from fastapi import APIRouter, Request, Response
+from fastapi import APIRouter, Response
 
-from api.http.audit import by
+from api.http.auth import Enrolls
 from api.http.bodies import is_form, read_form, read_json
-from api.http.deps import (
-    Common,
-    Enrolls,
-    GateDep,
-    PreconditionDep,
-    RuntimeDep,
-    SubjectDep,
-    etag,
-)
-from api.http.openapi import BODY, EVERY_CALL, PHOTO, body_of, error_responses
+from api.http.deps import PreconditionDep, SubjectDep, etag
+from api.http.openapi import body_of
 from api.http.requests import EnrollmentForm, EnrollmentJson
 from api.http.schemas import EnrollmentAnswer, Photo
 from enroll import Holder
@@ -23,40 +15,18 @@ from templates.store.subject_rows import Source
 
 router = APIRouter(prefix="/v1/subjects", tags=["Enroll and verify"])
 
-CODES = (
-    *EVERY_CALL,
-    *BODY,
-    *PHOTO,
-    "too_many_images",
-    "forbidden",
-    "replayed",
-    "invalid_template",
-    "invalid_embedding",
-    "contract_mismatch",
-    "enrollment_conflict",
-    "inconsistent_images",
-)
-
 
 @router.put(
     "/{subject_id}/enrollment",
     responses={
         200: {"description": "An earlier enrollment was replaced."},
         201: {"model": EnrollmentAnswer, "description": "The subject is new."},
-        **error_responses(*CODES),
     },
     openapi_extra=body_of(form=EnrollmentForm, json=EnrollmentJson),
     summary="Enroll a subject, or replace its enrollment",
 )
 async def enroll(
-    request: Request,
-    response: Response,
-    caller: Enrolls,
-    subject: SubjectDep,
-    runtime: RuntimeDep,
-    gate: GateDep,
-    precondition: PreconditionDep,
-    common: Common,
+    call: Enrolls, subject: SubjectDep, precondition: PreconditionDep, response: Response
 ) -> EnrollmentAnswer:
     """Rights: `enroll`, and `embeddings` for a template, which the tenant must allow.
 
@@ -74,10 +44,11 @@ async def enroll(
 
     A token for this subject may stand in the place of the API key; the enrollment uses it up.
     """
-    settings, tenant, token = runtime.settings, caller.tenant, caller.subject_token
+    runtime, settings, tenant = call.runtime, call.runtime.settings, call.tenant
+    request, token = call.request, call.token
     if token is not None:
         precondition = token.precondition(precondition)
-    async with gate.admitted(caller.prefix):
+    async with call.place():
         sent: EnrollmentForm | EnrollmentJson
         if is_form(request):
             runtime.required_pack()
@@ -86,8 +57,8 @@ async def enroll(
         else:
             sent = await read_json(request, settings, EnrollmentJson, photos="images")
             # After the fields: who only forgot how to send a photo needs no further right.
-            caller.require("embeddings")
-            await gate.query(lambda: runtime.require_template_enrollment(tenant))
+            call.require("embeddings")
+            await call.query(lambda: runtime.require_template_enrollment(tenant))
 
         def work() -> EnrollmentAnswer:
             if token is not None:
@@ -119,10 +90,10 @@ async def enroll(
                 photos=enrollment.photos,
                 precondition=precondition,
                 token=None if token is None else token.digest,
-                by=by(request),
+                by=call.by,
             )
             return EnrollmentAnswer(
-                **common,
+                **call.common,
                 template_id=stored.template_id,
                 contract_id=enrollment.contract_id,
                 replaced=not stored.created,
@@ -133,7 +104,7 @@ async def enroll(
                 ],
             )
 
-        answer = await gate.compute(work, key=caller.prefix)
+        answer = await call.compute(work)
     response.status_code = 200 if answer.replaced else 201
     response.headers["ETag"] = etag(answer.template_id)
     return answer

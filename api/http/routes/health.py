@@ -7,7 +7,6 @@ from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
 from starlette.responses import Response
 
 from api.http.answers import answer
-from api.http.openapi import error_responses
 from api.http.schemas import HealthAnswer
 from api.service.metrics import exposition
 from api.service.operations import Readiness
@@ -19,7 +18,6 @@ router = APIRouter(tags=["Operations"])
 @router.get(
     "/health/live",
     response_model=HealthAnswer,
-    responses=error_responses("overloaded", "internal_error"),
     summary="The process answers",
 )
 async def live(request: Request) -> Response:
@@ -31,9 +29,6 @@ async def live(request: Request) -> Response:
 @router.get(
     "/health/ready",
     response_model=HealthAnswer,
-    responses=error_responses(
-        "store_unavailable", "model_unavailable", "overloaded", "internal_error"
-    ),
     summary="The worker can answer requests",
 )
 async def ready(request: Request) -> Response:
@@ -59,7 +54,6 @@ async def ready(request: Request) -> Response:
                 }
             },
         },
-        **error_responses("overloaded", "internal_error"),
     },
     summary="What the service has done, for Prometheus",
 )

@@ -5,16 +5,14 @@ from pathlib import Path as FilePath
 from typing import Annotated
 
 import anyio
-from fastapi import APIRouter, Depends, Path, Request
+from fastapi import APIRouter, Depends, Path
 from starlette.requests import ClientDisconnect
 from starlette.responses import FileResponse, Response
 from starlette.types import Receive, Scope, Send
 
 from api.http.answers import has_copy
-from api.http.auth import CallerDep
-from api.http.deps import Common, RuntimeDep
+from api.http.auth import AnyCall
 from api.http.errors import ApiError
-from api.http.openapi import EVERY_CALL, error_responses
 from api.http.schemas import PackAnswer, PackFileEntry
 from api.http.tokens import SubjectToken
 from api.limits.admission import Downloads
@@ -28,7 +26,7 @@ SLOWEST_BYTES_S = 64 * 1024
 """How long a download may take: some seconds, and more of them the larger the file is."""
 
 
-async def token_of(caller: CallerDep) -> SubjectToken:
+async def token_of(call: AnyCall) -> SubjectToken:
     """Demand a token.
 
     Raises
@@ -36,13 +34,13 @@ async def token_of(caller: CallerDep) -> SubjectToken:
     ApiError
         ``forbidden`` for an API key.
     """
-    if caller.subject_token is None:
+    if call.token is None:
         raise ApiError(
             "forbidden",
             "the graphs are for pages: ask for a token (POST /v1/tokens), and send that",
             {"token": "missing"},
         )
-    return caller.subject_token
+    return call.token
 
 
 class _GraphFile(FileResponse):
@@ -71,22 +69,21 @@ class _GraphFile(FileResponse):
 @router.get(
     "",
     dependencies=[Depends(token_of)],
-    responses=error_responses(*EVERY_CALL, "forbidden", "not_found", "replayed"),
     summary="The graphs that the contract names",
 )
-async def list_pack(runtime: RuntimeDep, common: Common) -> PackAnswer:
+async def list_pack(call: AnyCall) -> PackAnswer:
     """Right: a token, of any action. Only where the deployment serves its pack (`serve_pack`).
 
     An API key is `forbidden`: its server has no use for the graphs.
     """
-    pack = runtime.pack
-    if pack is None or not runtime.graphs:
+    pack, graphs = call.runtime.pack, call.runtime.graphs
+    if pack is None or not graphs:
         raise _not_served()
     return PackAnswer(
-        **common,
+        **call.common,
         name=pack.info.name,
         licence=licence_of(pack),
-        contract_id=runtime.contract.contract_id,
+        contract_id=call.runtime.contract.contract_id,
         files=[
             PackFileEntry(
                 role=graph.role,
@@ -97,7 +94,7 @@ async def list_pack(runtime: RuntimeDep, common: Common) -> PackAnswer:
                 path=f"{router.prefix}/{graph.sha256}",
                 input_size=list(graph.input_size),
             )
-            for graph in runtime.graphs.values()
+            for graph in graphs.values()
         ],
     )
 
@@ -113,21 +110,12 @@ async def list_pack(runtime: RuntimeDep, common: Common) -> PackAnswer:
             },
         },
         304: {"description": "The client's copy is the same."},
-        **error_responses(
-            *EVERY_CALL,
-            "forbidden",
-            "not_found",
-            "replayed",
-            "validation_failed",
-            "model_unavailable",
-        ),
     },
     summary="One graph",
 )
 async def get_pack_file(
-    request: Request,
+    call: AnyCall,
     token: Annotated[SubjectToken, Depends(token_of)],
-    runtime: RuntimeDep,
     sha256: Annotated[str, Path(description="Of a file of GET /v1/pack.")],
 ) -> Response:
     """Right: a token, of any action. Only where the deployment serves its pack.
@@ -137,14 +125,14 @@ async def get_pack_file(
     and a client that takes one more slowly than 64 KiB a second is cut off.
     """
     # Looked up among the few that are served: no part of the path reaches the file system.
-    graph = runtime.graphs.get(sha256)
+    graph = call.runtime.graphs.get(sha256)
     if graph is None:
         raise _not_served()
     headers = {"ETag": f'"{graph.sha256}"', "Cache-Control": KEPT}
-    if has_copy(request, headers["ETag"]):
+    if has_copy(call.request, headers["ETag"]):
         return Response(status_code=304, headers=headers)
     graph.require_unchanged()
-    downloads: Downloads = request.app.state.downloads
+    downloads: Downloads = call.request.app.state.downloads
     return _GraphFile(
         graph.path,
         headers=headers,

@@ -2,12 +2,12 @@
 
 from typing import Any
 
-from fastapi import APIRouter, Request
+from fastapi import APIRouter
 
+from api.http.auth import EnrollsOrVerifies
 from api.http.bodies import read_form
-from api.http.deps import Common, EnrollsOrVerifies, GateDep, RuntimeDep
 from api.http.errors import plain_details
-from api.http.openapi import BODY, CHECKED_PHOTO, EVERY_CALL, body_of, error_responses
+from api.http.openapi import body_of
 from api.http.requests import PhotoCheckForm
 from api.http.schemas import PhotoCheckAnswer
 from api.service.metrics import step
@@ -18,24 +18,22 @@ router = APIRouter(prefix="/v1/photos", tags=["Enroll and verify"])
 
 @router.post(
     "/check",
-    responses=error_responses(*EVERY_CALL, *BODY, *CHECKED_PHOTO, "forbidden"),
     openapi_extra=body_of(form=PhotoCheckForm),
     summary="Would this photo do?",
 )
-async def check_photo(
-    request: Request, caller: EnrollsOrVerifies, runtime: RuntimeDep, gate: GateDep, common: Common
-) -> PhotoCheckAnswer:
+async def check_photo(call: EnrollsOrVerifies) -> PhotoCheckAnswer:
     """Right: `enroll` or `verify`. For guidance before a camera: finds the face, measures it.
 
     The same detector and the same limits as enrollment, and no embedding: nothing is compared,
     and nothing is kept. A photo that would be refused for its face is answered with 200 and
     `usable` false.
     """
-    async with gate.admitted(caller.prefix):
+    runtime = call.runtime
+    async with call.place():
         pack = runtime.required_pack()
         with step("body"):
             sent = await read_form(
-                request, runtime.settings, PhotoCheckForm, photos="image", most=1
+                call.request, runtime.settings, PhotoCheckForm, photos="image", most=1
             )
 
         def work() -> PhotoCheckAnswer:
@@ -46,7 +44,7 @@ async def check_photo(
             except FaceError as refusal:
                 code: Any = refusal.code
                 return PhotoCheckAnswer(
-                    **common,
+                    **call.common,
                     usable=False,
                     code=code,
                     message=str(refusal),
@@ -58,7 +56,7 @@ async def check_photo(
             if taken.face is None:
                 message = "an aligned crop of a face, clear enough"
             return PhotoCheckAnswer(
-                **common,
+                **call.common,
                 usable=True,
                 code=None,
                 message=message,
@@ -67,4 +65,4 @@ async def check_photo(
                 quality=taken.quality.as_dict(),
             )
 
-        return await gate.compute(work, key=caller.prefix)
+        return await call.compute(work)

@@ -2,23 +2,11 @@
 
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import APIRouter, Query, Response
 
-from api.http.audit import by
-from api.http.deps import (
-    Common,
-    Cursor,
-    Enrolls,
-    Erases,
-    GateDep,
-    Limit,
-    NoPreconditionDep,
-    RuntimeDep,
-    SubjectDep,
-    etag,
-)
+from api.http.auth import Enrolls, Erases
+from api.http.deps import Cursor, Limit, NoPreconditionDep, SubjectDep, etag
 from api.http.errors import ApiError
-from api.http.openapi import EVERY_CALL, error_responses
 from api.http.receipts import receipt_json
 from api.http.schemas import ReceiptAnswer, Subject, SubjectAnswer, SubjectsAnswer
 from templates.contract.document import Binding
@@ -29,14 +17,10 @@ router = APIRouter(prefix="/v1/subjects", tags=["People"])
 
 @router.get(
     "",
-    responses=error_responses(*EVERY_CALL, "forbidden", "validation_failed"),
     summary="The tenant's subjects, page by page",
 )
 async def list_subjects(
-    caller: Enrolls,
-    runtime: RuntimeDep,
-    gate: GateDep,
-    common: Common,
+    call: Enrolls,
     limit: Limit = 100,
     cursor: Cursor = None,
     prefix: Annotated[
@@ -44,14 +28,12 @@ async def list_subjects(
     ] = "",
 ) -> SubjectsAnswer:
     """Right: `enroll`. Metadata only, in the order of the subject ids."""
-    page = await gate.query(
-        lambda: runtime.store.subjects.list(
-            caller.tenant, limit=limit, cursor=cursor, prefix=prefix
-        )
+    page = await call.query(
+        lambda: call.store.subjects.list(call.tenant, limit=limit, cursor=cursor, prefix=prefix)
     )
-    binding = runtime.contract.binding
+    binding = call.runtime.contract.binding
     return SubjectsAnswer(
-        **common,
+        **call.common,
         subjects=[Subject(**_described(record, binding)) for record in page.records],
         next_cursor=page.next_cursor,
     )
@@ -59,38 +41,23 @@ async def list_subjects(
 
 @router.get(
     "/{subject_id}",
-    responses=error_responses(*EVERY_CALL, "forbidden", "not_enrolled", "validation_failed"),
     summary="One subject",
 )
-async def get_subject(
-    response: Response,
-    caller: Enrolls,
-    subject: SubjectDep,
-    runtime: RuntimeDep,
-    gate: GateDep,
-    common: Common,
-) -> SubjectAnswer:
+async def get_subject(call: Enrolls, subject: SubjectDep, response: Response) -> SubjectAnswer:
     """Right: `enroll`. Metadata only, never template bytes."""
-    record = await gate.query(lambda: runtime.store.subjects.describe(caller.tenant, subject))
+    record = await call.query(lambda: call.store.subjects.describe(call.tenant, subject))
     if record is None:
         raise ApiError("not_enrolled", "nobody is enrolled under this id")
     response.headers["ETag"] = etag(record.template_id)
-    return SubjectAnswer(**common, **_described(record, runtime.contract.binding))
+    return SubjectAnswer(**call.common, **_described(record, call.runtime.contract.binding))
 
 
 @router.delete(
     "/{subject_id}",
-    responses=error_responses(*EVERY_CALL, "forbidden", "not_enrolled", "validation_failed"),
     summary="Erase a subject",
 )
 async def erase_subject(
-    request: Request,
-    caller: Erases,
-    subject: SubjectDep,
-    runtime: RuntimeDep,
-    gate: GateDep,
-    _precondition: NoPreconditionDep,
-    common: Common,
+    call: Erases, subject: SubjectDep, _precondition: NoPreconditionDep
 ) -> ReceiptAnswer:
     """Right: `erase`. Erases template, metadata and data key; answers with a signed receipt.
 
@@ -101,20 +68,20 @@ async def erase_subject(
     """
 
     def work() -> ReceiptAnswer:
-        store = runtime.store
+        store, tenant = call.store, call.tenant
         if (
-            caller.sees_enrollment
-            and store.subjects.describe(caller.tenant, subject) is None
-            and store.erasures.receipt(caller.tenant, subject) is None
+            call.sees_enrollment
+            and store.subjects.describe(tenant, subject) is None
+            and store.erasures.receipt(tenant, subject) is None
         ):
             raise ApiError("not_enrolled", "nobody was ever enrolled under this id")
-        erasure = store.erasures.erase(caller.tenant, subject, by=by(request))
-        request.state.log["log_purged"] = erasure.log_purged
+        erasure = store.erasures.erase(tenant, subject, by=call.by)
+        call.request.state.log["log_purged"] = erasure.log_purged
         return ReceiptAnswer(
-            **common, **receipt_json(erasure.receipt), log_purged=erasure.log_purged
+            **call.common, **receipt_json(erasure.receipt), log_purged=erasure.log_purged
         )
 
-    return await gate.query(work)
+    return await call.query(work)
 
 
 def _described(record: SubjectRecord, binding: Binding) -> dict[str, Any]:

@@ -2,13 +2,12 @@
 
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Path, Request
+from fastapi import APIRouter, Path
 
-from api.http.audit import by
-from api.http.auth import CallerDep, note_subject
+from api.http.auth import AnyCall, EnrollsOrVerifies
 from api.http.bodies import read_json
-from api.http.deps import Common, EnrollsOrVerifies, GateDep, RuntimeDep, SubjectDep
-from api.http.openapi import BODY, EVERY_CALL, body_of, error_responses
+from api.http.deps import SubjectDep
+from api.http.openapi import body_of
 from api.http.requests import TokenJson
 from api.http.schemas import TokenAnswer, TokenOutcomeAnswer
 from api.http.tokens import new_token
@@ -21,13 +20,10 @@ router = APIRouter(prefix="/v1", tags=["Tokens"])
 @router.post(
     "/tokens",
     status_code=201,
-    responses=error_responses(*EVERY_CALL, *BODY, "forbidden", "uncalibrated"),
     openapi_extra=body_of(json=TokenJson),
     summary="Make a token for a browser",
 )
-async def create_token(
-    request: Request, caller: CallerDep, runtime: RuntimeDep, gate: GateDep, common: Common
-) -> TokenAnswer:
+async def create_token(call: AnyCall) -> TokenAnswer:
     """Right: `verify` or `enroll`, as the action. For one call of one subject, within two minutes.
 
     A browser holds it in place of an API key: it is good for one decision at one level, or for one
@@ -35,36 +31,31 @@ async def create_token(
     pack. With `"replace": false` its enrollment replaces nobody. It answers alike whether the
     subject is enrolled or not. Ask with its `token_id` what came of it; never believe the page.
     """
-    async with gate.admitted(caller.prefix):
-        asked = await read_json(request, runtime.settings, TokenJson)
-    note_subject(request, caller, asked.subject_id)
-    caller.require(asked.action)
+    runtime = call.runtime
+    async with call.place():
+        asked = await read_json(call.request, runtime.settings, TokenJson)
+    pseudonym = call.note_subject(asked.subject_id)
+    call.require(asked.action)
     level = None
     if asked.action == "verify":
-        level = runtime.levels.in_force(asked.level, lowest_of_key=caller.lowest_level)
+        level = runtime.levels.in_force(asked.level, lowest_of_key=call.key.lowest_level)
     token, text = new_token(
         runtime.keyring,
-        key_id=caller.key_id,
-        key_prefix=caller.prefix,
+        key_id=call.key.id,
+        key_prefix=call.key.prefix,
         subject=asked.subject_id,
         action=asked.action,
         level=level,
         lifetime_s=asked.lifetime_s,
         replace=asked.replace,
     )
-    entry = Entry(
-        "token",
-        "issued",
-        by(request),
-        caller.tenant,
-        request.state.pseudonym,
-        f"{token.action} {token.token_id}",
-    )
-    await gate.query(lambda: runtime.store.audit_log.record(entry))
-    request.state.log["token_id"] = token.token_id
+    detail = f"{token.action} {token.token_id}"
+    entry = Entry("token", "issued", call.by, call.tenant, pseudonym, detail)
+    await call.query(lambda: call.store.audit_log.record(entry))
+    call.request.state.log["token_id"] = token.token_id
     TOKENS.labels(token.action).inc()
     return TokenAnswer(
-        **common,
+        **call.common,
         token=text,
         token_id=token.token_id,
         subject_id=token.subject,
@@ -76,16 +67,11 @@ async def create_token(
 
 @router.get(
     "/subjects/{subject_id}/tokens/{token_id}",
-    responses=error_responses(*EVERY_CALL, "forbidden", "validation_failed"),
     summary="What came of a token",
 )
 async def get_token_outcome(
-    request: Request,
-    caller: EnrollsOrVerifies,
-    _subject: SubjectDep,
-    runtime: RuntimeDep,
-    gate: GateDep,
-    common: Common,
+    call: EnrollsOrVerifies,
+    subject: SubjectDep,
     token_id: Annotated[
         str,
         Path(
@@ -101,15 +87,15 @@ async def get_token_outcome(
     For a token that another key asked for, of another subject, or that nobody asked for, it
     answers what it answers for one that was not used.
     """
-    digest = token_digest(caller.prefix, token_id)
-    line = await gate.query(lambda: runtime.store.audit_log.use_of(digest))
-    if line is None or line.pseudonym != request.state.pseudonym:
+    digest = token_digest(call.key.prefix, token_id)
+    line = await call.query(lambda: call.store.audit_log.use_of(digest))
+    if line is None or line.pseudonym != call.note_subject(subject):
         return TokenOutcomeAnswer(
-            **common, token_id=token_id, used=False, outcome=None, level=None, used_at=None
+            **call.common, token_id=token_id, used=False, outcome=None, level=None, used_at=None
         )
     outcome: Any = line.outcome
     return TokenOutcomeAnswer(
-        **common,
+        **call.common,
         token_id=token_id,
         used=True,
         outcome=outcome,

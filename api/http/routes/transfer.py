@@ -2,22 +2,13 @@
 
 import base64
 
-from fastapi import APIRouter, Request, Response
+from fastapi import APIRouter, Response
 
-from api.http.audit import by
-from api.http.auth import note_subject
+from api.http.auth import Exports
 from api.http.bodies import read_json
-from api.http.deps import (
-    Common,
-    Exports,
-    GateDep,
-    PreconditionDep,
-    RuntimeDep,
-    SubjectDep,
-    etag,
-)
+from api.http.deps import PreconditionDep, SubjectDep, etag
 from api.http.errors import ApiError
-from api.http.openapi import BODY, EVERY_CALL, body_of, error_responses
+from api.http.openapi import body_of
 from api.http.requests import ImportJson
 from api.http.schemas import ExportAnswer, ImportAnswer
 from api.http.transfer import open_export
@@ -29,38 +20,22 @@ router = APIRouter(prefix="/v1/subjects", tags=["People"])
 
 @router.get(
     "/{subject_id}/export",
-    responses=error_responses(
-        *EVERY_CALL,
-        "forbidden",
-        "not_enrolled",
-        "not_found",
-        "validation_failed",
-        "contract_mismatch",
-    ),
     summary="Export a subject, encrypted",
 )
-async def export_subject(
-    request: Request,
-    caller: Exports,
-    subject: SubjectDep,
-    runtime: RuntimeDep,
-    gate: GateDep,
-    common: Common,
-) -> ExportAnswer:
+async def export_subject(call: Exports, subject: SubjectDep) -> ExportAnswer:
     """Right: `export`. The template is un-rotated inside the encryption; a holder's rotation stays.
 
     Only keys with `enroll` or `admin` are told `not_enrolled`; others get `not_found`.
     """
-    async with gate.admitted(caller.prefix):
-        exported = await gate.compute(
-            lambda: runtime.export(caller.tenant, subject, by=by(request)), key=caller.prefix
-        )
+    runtime = call.runtime
+    async with call.place():
+        exported = await call.compute(lambda: runtime.export(call.tenant, subject, by=call.by))
     if exported is None:
-        if caller.sees_enrollment:
+        if call.sees_enrollment:
             raise ApiError("not_enrolled", "nobody is enrolled under this id")
         raise ApiError("not_found", "there is nothing to export")
     return ExportAnswer(
-        **common,
+        **call.common,
         export=base64.b64encode(exported).decode("ascii"),
         contract_id=runtime.contract.contract_id,
         key_id=runtime.export_key.key_id,
@@ -72,26 +47,12 @@ async def export_subject(
     responses={
         200: {"description": "An earlier enrollment was replaced."},
         201: {"model": ImportAnswer, "description": "The subject is new."},
-        **error_responses(
-            *EVERY_CALL,
-            *BODY,
-            "forbidden",
-            "invalid_template",
-            "contract_mismatch",
-            "enrollment_conflict",
-        ),
     },
     openapi_extra=body_of(json=ImportJson),
     summary="Import a subject that was exported",
 )
 async def import_subject(
-    request: Request,
-    response: Response,
-    caller: Exports,
-    runtime: RuntimeDep,
-    gate: GateDep,
-    precondition: PreconditionDep,
-    common: Common,
+    call: Exports, precondition: PreconditionDep, response: Response
 ) -> ImportAnswer:
     """Rights: `export` and `admin`. The template gets a new id, and a rotation of the tenant's.
 
@@ -99,22 +60,23 @@ async def import_subject(
     erased since, and undoes a later enrollment: the audit log has a line, with the action `import`.
     `If-None-Match` and `If-Match` say what may be replaced, as of an enrollment.
     """
-    caller.require("admin")
-    async with gate.admitted(caller.prefix):
-        sent = await read_json(request, runtime.settings, ImportJson)
-        exported = await gate.query(
+    call.require("admin")
+    runtime = call.runtime
+    async with call.place():
+        sent = await read_json(call.request, runtime.settings, ImportJson)
+        exported = await call.query(
             lambda: open_export(
                 sent.export,
                 key=runtime.export_key,
-                tenant=caller.tenant,
+                tenant=call.tenant,
                 contract_id=runtime.contract.contract_id,
             )
         )
-        note_subject(request, caller, checked_subject_id(exported.subject_id))
+        call.note_subject(checked_subject_id(exported.subject_id))
 
         def work() -> ImportAnswer:
-            epoch = runtime.epoch(caller.tenant)
-            enroller = runtime.enroller(caller.tenant, epoch)
+            epoch = runtime.epoch(call.tenant)
+            enroller = runtime.enroller(call.tenant, epoch)
             salt = exported.holder_salt
             # A template that the service made of photos is no client's. One that is in a holder's
             # rotation cannot be held against strangers: it was when it was enrolled.
@@ -124,7 +86,7 @@ async def import_subject(
                 enrollment = enroller.from_template(exported.wire)
 
             stored = runtime.put(
-                caller.tenant,
+                call.tenant,
                 exported.subject_id,
                 epoch,
                 enrollment,
@@ -132,10 +94,10 @@ async def import_subject(
                 photos=exported.photos,
                 precondition=precondition,
                 action="import",
-                by=by(request),
+                by=call.by,
             )
             return ImportAnswer(
-                **common,
+                **call.common,
                 subject_id=exported.subject_id,
                 template_id=stored.template_id,
                 contract_id=enrollment.contract_id,
@@ -143,7 +105,7 @@ async def import_subject(
                 holder_key=salt is not None,
             )
 
-        answer = await gate.compute(work, key=caller.prefix)
+        answer = await call.compute(work)
     response.status_code = 200 if answer.replaced else 201
     response.headers["ETag"] = etag(answer.template_id)
     return answer

@@ -12,15 +12,14 @@ no more are answered than of requests that come one after the other.
 from collections.abc import Callable
 from functools import partial
 
-from fastapi import APIRouter, Request
+from fastapi import APIRouter
 
-from api.http.audit import by
-from api.http.auth import Caller
+from api.http.auth import Call, Verifies
 from api.http.bodies import is_form, read_form, read_json, too_many_images
 from api.http.challenges import Challenge, opened_challenge
-from api.http.deps import Common, GateDep, RuntimeDep, SubjectDep, Verifies
+from api.http.deps import SubjectDep
 from api.http.errors import ApiError
-from api.http.openapi import BODY, EVERY_CALL, PHOTO, body_of, error_responses
+from api.http.openapi import body_of
 from api.http.requests import VerifyForm, VerifyJson
 from api.http.schemas import VerifyAnswer
 from api.service.metrics import count_decision, step
@@ -28,7 +27,6 @@ from api.service.runtime import Runtime
 from templates.errors import ContractMismatch
 from templates.keys.holder_key import wipe
 from templates.store.attempts import Attempt
-from templates.store.audit_log import By
 from verify import (
     MAX_FRAMES,
     MAX_PROBE_PHOTOS,
@@ -42,36 +40,13 @@ from verify import (
 
 router = APIRouter(prefix="/v1/subjects", tags=["Enroll and verify"])
 
-CODES = (
-    *EVERY_CALL,
-    *BODY,
-    *PHOTO,
-    "forbidden",
-    "not_enrolled",
-    "invalid_template",
-    "invalid_embedding",
-    "inconsistent_images",
-    "contract_mismatch",
-    "uncalibrated",
-    "replayed",
-    "locked_out",
-)
-
 
 @router.post(
     "/{subject_id}/verify",
-    responses=error_responses(*CODES),
     openapi_extra=body_of(form=VerifyForm, json=VerifyJson),
     summary="Is this the subject?",
 )
-async def verify(
-    request: Request,
-    caller: Verifies,
-    subject: SubjectDep,
-    runtime: RuntimeDep,
-    gate: GateDep,
-    common: Common,
-) -> VerifyAnswer:
+async def verify(call: Verifies, subject: SubjectDep) -> VerifyAnswer:
     """Rights: `verify`, and `embeddings` for a probe that is not a photo.
 
     The probe is 1 to 5 photos, or embeddings, which must show one and the same person and are
@@ -93,23 +68,23 @@ async def verify(
 
     A token for this subject may stand in the place of the API key; the decision uses it up.
     """
-    token = caller.subject_token
-    async with gate.admitted(caller.prefix):
+    runtime, token = call.runtime, call.token
+    async with call.place():
         with step("body"):
-            sent = await _sent(request, runtime, caller)
+            sent = await _sent(call)
         asked = sent.level if token is None else token.level_of(sent.level)
-        level = runtime.levels.in_force(asked, lowest_of_key=caller.lowest_level)
-        challenge = _challenge(runtime, caller, subject, sent.challenge_id)
+        level = runtime.levels.in_force(asked, lowest_of_key=call.key.lowest_level)
+        challenge = _challenge(call, subject, sent.challenge_id)
 
         def work() -> Decision:
             try:
-                return _decide(runtime, caller, subject, sent, level, challenge, by(request))
+                return _decide(call, subject, sent, level, challenge)
             finally:
                 wipe(sent.holder_key)
 
-        decision = await gate.compute(work, key=caller.prefix)
+        decision = await call.compute(work)
     answer = VerifyAnswer(
-        **common,
+        **call.common,
         decision="accept" if decision.accepted else "reject",
         reason=decision.reason,
         liveness=decision.liveness,
@@ -117,24 +92,24 @@ async def verify(
         fmr=decision.fmr,
         contract_id=decision.contract_id,
         calibration_id=decision.calibration_id,
-        distance=decision.distance if caller.sees_scores else None,
-        liveness_failure=decision.liveness_failure if caller.sees_scores else None,
+        distance=decision.distance if call.sees_scores else None,
+        liveness_failure=decision.liveness_failure if call.sees_scores else None,
         advice=decision.advice,
     )
-    request.state.log.update(
+    call.request.state.log.update(
         security_level=level, decision=answer.decision, liveness=answer.liveness
     )
     count_decision(accepted=decision.accepted, reason=decision.reason, level=level, probe=sent.kind)
     return answer
 
 
-async def _sent(request: Request, runtime: Runtime, caller: Caller) -> VerifyForm | VerifyJson:
+async def _sent(call: Call) -> VerifyForm | VerifyJson:
     """Read the probe, and refuse what can be refused without decoding anything."""
-    settings = runtime.settings
+    request, runtime, settings = call.request, call.runtime, call.runtime.settings
     if not is_form(request):
         sent = await read_json(request, settings, VerifyJson, photos="image")
         # After the fields: who only forgot how to send a photo needs no further right.
-        caller.require("embeddings")
+        call.require("embeddings")
         runtime.liveness.require(photos=False, challenge=False)
         return sent
     runtime.required_pack()
@@ -153,45 +128,42 @@ async def _sent(request: Request, runtime: Runtime, caller: Caller) -> VerifyFor
     return form
 
 
-def _challenge(
-    runtime: Runtime, caller: Caller, subject: str, challenge_id: str | None
-) -> Challenge | None:
+def _challenge(call: Call, subject: str, challenge_id: str | None) -> Challenge | None:
     if challenge_id is None:
         return None
     return opened_challenge(
-        runtime.keyring,
+        call.runtime.keyring,
         challenge_id,
-        tenant=caller.tenant,
+        tenant=call.tenant,
         subject=subject,
-        token=caller.subject_token,
+        token=call.token,
     )
 
 
 def _decide(
-    runtime: Runtime,
-    caller: Caller,
+    call: Call,
     subject: str,
     sent: VerifyForm | VerifyJson,
     level: str,
     challenge: Challenge | None,
-    who: By,
 ) -> Decision:
     """Make the probe, decide, and record; a subject that is not enrolled costs what others do."""
-    if caller.subject_token is not None:
+    runtime = call.runtime
+    if call.token is not None:
         # Once more: the body and the turn to compute may have taken a while.
-        caller.subject_token.require_in_time()
+        call.token.require_in_time()
     probe = _probe(runtime, sent, challenge)
     live = challenge is not None or runtime.liveness.policy.passive
-    spent = challenge or caller.subject_token
+    spent = challenge or call.token
 
     def compare(attempt: Attempt) -> Decision:
         template, epoch = attempt.template, attempt.rotation_epoch
         if template is not None:
             epoch = template.record.rotation_epoch
-        elif caller.sees_enrollment:
-            raise _why_not(runtime, caller.tenant, subject)
+        elif call.sees_enrollment:
+            raise _why_not(runtime, call.tenant, subject)
         stored = template or runtime.stand_in.open()
-        verifier = runtime.verifier(caller.tenant, epoch)
+        verifier = runtime.verifier(call.tenant, epoch)
         with step("decide"):
             if isinstance(probe, bytes):
                 return verifier.decide_template(
@@ -209,12 +181,12 @@ def _decide(
         return decision.with_advice(clear=probe.clear)
 
     return runtime.store.attempts.decide(
-        caller.tenant,
+        call.tenant,
         subject,
         compare,
         contract_id=runtime.contract.contract_id,
         token=None if spent is None else spent.digest,
-        by=who,
+        by=call.by,
     )
 
 
