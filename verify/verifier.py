@@ -17,13 +17,11 @@ from templates.distances import paired_distances, similarity
 from templates.errors import ContractMismatch, InvalidTemplate
 from templates.keys.randomness import KEY_BYTES
 from templates.keys.rotation import HolderKey, TenantRotation, holder_rotation
-from templates.space.agreement import mean_embedding
 from templates.space.embedding import unit_rows
 from templates.space.subspace import SubspaceBatch, Turn
-from verify.challenge import Movement
 from verify.cohort import Probes, expected_similarity
 from verify.decision import Decision, StandIn
-from verify.photo_probe import MAX_PROBE_PHOTOS, PhotoProbe, probe_of_frames, probe_of_photos
+from verify.photo_probe import MAX_PROBE_PHOTOS, PhotoProbe, probe_of_photos
 
 _NO_SALT = "0" * 32
 
@@ -111,43 +109,11 @@ class Verifier:
             pack, self._contract, photos, passive=passive, policy=policy, limits=limits
         )
 
-    def frames_probe(
-        self,
-        pack: ModelPack,
-        frames: Sequence[bytes],
-        movements: Sequence[Movement],
-        *,
-        passive: bool = False,
-        policy: FacePolicy = FacePolicy.DOMINANT,
-        limits: ImageLimits = DEFAULT_LIMITS,
-    ) -> PhotoProbe:
-        """Make one probe of the frames of a challenge, and say whether they meet it.
-
-        Parameters and errors as in :func:`verify.photo_probe.probe_of_frames`.
-        """
-        self._require(pack)
-        return probe_of_frames(
-            pack, self._contract, frames, movements, passive=passive, policy=policy, limits=limits
-        )
-
     def _require(self, pack: ModelPack) -> None:
         info = pack.info
         self._contract.binding.require_embedder(
             embedder_sha256=info.embedder_sha256, preprocessing=info.preprocessing, n=info.n
         )
-
-    def average(self, embeddings: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Make one probe, (n,), of 1 to 5 unit embeddings of one person, (k, n): their mean.
-
-        Raises
-        ------
-        InvalidEmbedding
-            Where an embedding is not a finite unit vector of n numbers.
-        InconsistentImages
-            Where they are not of one person.
-        """
-        rows = unit_rows(embeddings, n=self._contract.binding.n, most=MAX_PROBE_PHOTOS)
-        return mean_embedding(rows, consistency=self._contract.probe_consistency)
 
     def decide_embedding(
         self,

@@ -49,11 +49,6 @@ class Sealed(BaseModel):
         text = keyring.seal(self.model_dump_json().encode(), purpose=purpose, bound_to=bound_to)
         return base64.urlsafe_b64encode(text).rstrip(b"=").decode("ascii")
 
-    @property
-    def late(self) -> bool:
-        """Whether its time is over."""
-        return self.expires_at < datetime.now(UTC)
-
     def require_in_time(self) -> None:
         """Refuse what is late.
 
@@ -63,7 +58,7 @@ class Sealed(BaseModel):
             Without a line in the audit log: anybody who finds an old token could write there for
             ever.
         """
-        if self.late:
+        if self.expires_at < datetime.now(UTC):
             raise Replayed("it has expired: ask for another one", recorded=True)
 
 

@@ -5,11 +5,16 @@ from typing import Any
 
 import numpy as np
 
+from api.http.schemas import VerifyAnswer
 from templates.contract import wire
 from templates.keys.randomness import Keystream
 from templates.space.lifting import Strategy, lift
 from tests.api.client import Client
-from tests.api.deployment import PROBE_M, Deployment, M, N, bearer, photo, unit
+from tests.api.deployment import PROBE_M, Deployment, M, N, bearer, images, photo, unit
+from tests.api.shapes import assert_answer
+
+AFTER = 5
+"""Failures after which a subject is locked, by default."""
 
 
 def b64(data: bytes) -> str:
@@ -51,3 +56,24 @@ def ask(client: Client, token: str, subject: str = "alice", **request: Any) -> A
     """Verify a subject with an API key or a token."""
     headers = bearer(token) | request.pop("headers", {})
     return client.post(f"/v1/subjects/{subject}/verify", headers=headers, **request)
+
+
+def enroll(client: Client, subject: str = "alice", person: int = 1) -> None:
+    answer = client.put(
+        f"/v1/subjects/{subject}/enrollment", files=images(photo(person), photo(person, 1))
+    )
+    assert answer.status_code == 201, answer.text
+
+
+def attempt(client: Client, token: str, person: int, subject: str = "alice") -> Any:
+    return client.post(
+        f"/v1/subjects/{subject}/verify",
+        files=images(photo(person, 9), name="image"),
+        headers=bearer(token),
+    )
+
+
+def fail(client: Client, token: str, times: int, subject: str = "alice") -> None:
+    for _ in range(times):
+        answer = attempt(client, token, 2, subject)
+        assert assert_answer(answer, 200, VerifyAnswer)["decision"] == "reject"

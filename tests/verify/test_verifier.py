@@ -30,7 +30,7 @@ from tests.verify.synthetic import (
     tenant_rotation,
     unit,
 )
-from verify import Calibrated, Decision, StandIn, Verifier
+from verify import Calibrated, Decision, StandIn, Verifier, probe_of_embeddings
 
 NEW = draw_people(12, photos=(4,), seed=55)
 ROTATION = tenant_rotation()
@@ -422,11 +422,11 @@ def test_photos_of_a_probe_need_to_agree_less_than_those_of_an_enrollment(
     strict = dataclasses.replace(contract, photo_consistency=0.9, probe_consistency=0.5)
     rows = np.zeros((2, N), dtype=np.float32)
     rows[:, 0], rows[0, 1], rows[1, 1] = 0.9, 0.19**0.5, -(0.19**0.5)  # cosine 0.62
-    mean = verifier_of(strict).average(rows)
+    mean = probe_of_embeddings(strict, rows).embedding
     assert mean[0] == pytest.approx(1.0, abs=1e-6)
     enroller = Enroller(strict, make_generator(), rotation=ROTATION, lift_secret=LIFT_SECRET)
     with pytest.raises(InconsistentImages):
         enroller.from_embeddings(rows)
     apart = dataclasses.replace(strict, probe_consistency=0.63)
     with pytest.raises(InconsistentImages):
-        verifier_of(apart).average(rows)
+        probe_of_embeddings(apart, rows)

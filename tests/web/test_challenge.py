@@ -9,7 +9,7 @@ from PIL import Image
 from playwright.sync_api import Browser, expect
 
 from tests.api.deployment import images
-from tests.api.http.test_passive_liveness import calibrated
+from tests.api.living import calibrated
 from tests.clients.javascript.conftest import require_client
 from tests.marked_heads import draw, encoded, frame, head
 from tests.web.browser_tab import BrowserTab

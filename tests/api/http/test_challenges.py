@@ -2,7 +2,7 @@
 
 import base64
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import httpx
@@ -12,18 +12,26 @@ import pytest
 from api.http import challenges
 from api.http.app import create_app
 from api.http.errors import StartError
-from api.http.schemas import ChallengeAnswer, VerifyAnswer
 from api.service.runtime import Runtime
 from models.pack import ModelPack
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, deploy, images, photo
-from tests.api.shapes import assert_answer, assert_error
+from tests.api.living import (
+    ANNA,
+    BEN,
+    PASSED,
+    answered,
+    challenge,
+    failed,
+    frames_of,
+    liveness,
+)
+from tests.api.shapes import assert_error
 from tests.heads import POSES, performed
 from tests.heads import photo as flat_photo
 from tests.marked_heads import draw, encoded, frame, write_marked_pack
 
 Service = tuple[Client, Deployment]
-ANNA, BEN = 1, 2
 
 
 def serve(folder: Any, **changes: Any) -> Iterator[Service]:
@@ -46,43 +54,6 @@ def off(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
 def active(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
     """A deployment that asks for a challenge."""
     yield from serve(tmp_path_factory.mktemp("active"), liveness="active")
-
-
-def challenge(client: Client, subject: str | None = None, **options: Any) -> dict[str, Any]:
-    body = {} if subject is None else {"subject_id": subject}
-    return assert_answer(client.post("/v1/challenges", json=body, **options), 200, ChallengeAnswer)
-
-
-def answered(
-    client: Client,
-    challenge_id: str,
-    frames: Sequence[bytes],
-    subject: str = "anna",
-    **options: Any,
-) -> httpx.Response:
-    answer: httpx.Response = client.post(
-        f"/v1/subjects/{subject}/verify",
-        files=images(*frames),
-        data={"challenge_id": challenge_id},
-        **options,
-    )
-    return answer
-
-
-def frames_of(names: Sequence[str], person: int = ANNA) -> list[bytes]:
-    return [frame(name, person) for name in names]
-
-
-def liveness(answer: httpx.Response) -> tuple[str, str, str, str | None]:
-    body = assert_answer(answer, 200, VerifyAnswer)
-    return body["decision"], body["reason"], body["liveness"], body.get("liveness_failure")
-
-
-PASSED = ("accept", "match", "passed", None)
-
-
-def failed(why: str) -> tuple[str, str, str, str]:
-    return "reject", "liveness", "failed", why
 
 
 def test_who_makes_the_movements_is_accepted(active: Service) -> None:

@@ -12,12 +12,12 @@ import pytest
 
 from api.http.app import create_app
 from api.http.schemas import LockoutAnswer, UnlockAnswer, VerifyAnswer
+from tests.api.calls import AFTER, attempt, enroll, fail
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, deploy, images, photo
 from tests.api.shapes import assert_answer, assert_error
 from tests.databases import migrate_ahead
 
-AFTER = 5
 FIRST_S = 3600
 
 
@@ -29,27 +29,6 @@ def both(tmp_path: Path, database_url: str) -> Iterator[tuple[Client, Deployment
     with Client(create_app(deployment.settings)) as running:
         running.headers.update(bearer(deployment.token))
         yield running, deployment
-
-
-def enroll(client: Client, subject: str = "alice", person: int = 1) -> None:
-    answer = client.put(
-        f"/v1/subjects/{subject}/enrollment", files=images(photo(person), photo(person, 1))
-    )
-    assert answer.status_code == 201, answer.text
-
-
-def attempt(client: Client, token: str, person: int, subject: str = "alice") -> Any:
-    return client.post(
-        f"/v1/subjects/{subject}/verify",
-        files=images(photo(person, 9), name="image"),
-        headers=bearer(token),
-    )
-
-
-def fail(client: Client, token: str, times: int, subject: str = "alice") -> None:
-    for _ in range(times):
-        answer = attempt(client, token, 2, subject)
-        assert assert_answer(answer, 200, VerifyAnswer)["decision"] == "reject"
 
 
 def test_a_subject_locks_and_the_right_face_waits_too(both: tuple[Client, Deployment]) -> None:

@@ -1,7 +1,6 @@
 """The policy that asks for photos that look live, over REST; before a black wall none does."""
 
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,14 +8,19 @@ import pytest
 
 from api.http.app import create_app
 from api.http.errors import StartError
-from api.service.opening import file_sealer, open_keyring
 from api.service.runtime import Runtime
 from api.settings import LivenessPolicy
-from models.pack import ModelPack
-from templates.contract.document import LivenessCalibration
 from tests.api.client import Client
-from tests.api.deployment import RATE, Deployment, bearer, deploy, images
-from tests.api.http.test_challenges import ANNA, PASSED, answered, challenge, failed, liveness
+from tests.api.deployment import bearer, deploy, images
+from tests.api.living import (
+    ANNA,
+    PASSED,
+    answered,
+    calibrated,
+    challenge,
+    failed,
+    liveness,
+)
 from tests.api.service.test_metrics import Rise
 from tests.heads import POSES, head, performed
 from tests.marked_heads import add_liveness, draw, encoded, write_marked_pack
@@ -27,23 +31,6 @@ PASSIVE = failed("passive")
 def shown(pose: str = "front", *, dark: bool = False, roll: float = 0.0) -> bytes:
     points = head(**{"roll": roll, **POSES[pose]})
     return encoded(draw(points, ANNA, background=0 if dark else 120))
-
-
-def calibrated(folder: Path, **changes: Any) -> Deployment:
-    """A deployment whose contract has a liveness threshold, which it does not ask for yet."""
-    pack_dir = add_liveness(write_marked_pack(folder / "pack"))
-    deployment = deploy(folder, pack=pack_dir, lockout_after=0)
-    graphs = ModelPack.load(pack_dir, threads=1).liveness
-    assert graphs is not None
-    contract = replace(
-        deployment.contract,
-        liveness=LivenessCalibration(
-            graphs=graphs.graphs, threshold=0.0, bpcer=RATE, target_bpcer=0.01
-        ),
-    )
-    settings = deployment.settings
-    contract.save(settings.resolved_contract_file, file_sealer(open_keyring(settings)))
-    return replace(deployment, settings=settings.model_copy(update=changes))
 
 
 def serve(folder: Path, policy: str) -> Iterator[Client]:

@@ -132,12 +132,6 @@ def test_opposite_embeddings_have_no_mean(client: Client, scored: str) -> None:
     assert assert_error(answer, 422, "inconsistent_images") == {"photos": [0, 1]}
 
 
-def test_embeddings_need_the_right(client: Client, deployment: Deployment) -> None:
-    rows = [embedding(client, 1)]
-    answer = ask(client, deployment.key("verify"), json={"embeddings": rows})
-    assert assert_error(answer, 403, "forbidden") == {"missing": ["embeddings"]}
-
-
 def test_a_burst_is_one_attempt(both: tuple[Client, Deployment]) -> None:
     client, deployment = both
     client.put("/v1/subjects/alice/enrollment", files=images(photo(1), photo(1, 1)))

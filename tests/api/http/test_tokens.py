@@ -27,7 +27,7 @@ from templates.store.audit_archive import TOKENS_LAST
 from templates.store.lockout import Replayed
 from tests.api.calls import b64, lifted, probe
 from tests.api.client import Client
-from tests.api.deployment import Deployment, bearer, deploy, images, photo
+from tests.api.deployment import Deployment, bearer, images, photo
 from tests.api.shapes import assert_answer, assert_error
 from tests.patience import wait_until
 
@@ -364,40 +364,6 @@ def test_a_theft_of_an_earlier_request_gives_the_one_call(shared: Service) -> No
     assert_error(enroll(client, writing, 3, "erin"), 401, "replayed")
 
 
-def test_only_a_token_that_opens_notes_the_use_of_its_key(shared: Service) -> None:
-    client, deployment = shared
-    token = issue(client)["token"]
-    store = open_store(deployment.settings, open_keyring(deployment.settings))
-    try:
-        key = store.api_keys.create("default", ["verify"]).key
-
-        def asked(text: str) -> httpx.Response:
-            return client.get("/v1/contract", headers=bearer(text))
-
-        def made(lifetime_s: int) -> str:
-            return new_token(
-                open_keyring(deployment.settings),
-                key_id=key.id,
-                key_prefix=key.prefix,
-                subject="alice",
-                action="verify",
-                level=STRICT,
-                lifetime_s=lifetime_s,
-            )[1]
-
-        assert_error(asked(f"vft_{key.prefix}_{token.split('_', 2)[2]}"), 401, "unauthorized")
-        assert_error(asked(made(-60)), 401, "replayed")
-        noted = store.api_keys.get(key.prefix)
-        assert noted is not None
-        assert noted.last_used_at is None
-        assert asked(made(60)).status_code == 200
-        noted = store.api_keys.get(key.prefix)
-        assert noted is not None
-        assert noted.last_used_at is not None
-    finally:
-        store.close()
-
-
 def test_a_holders_key_is_forgotten_where_nothing_is_decided(
     shared: Service, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -524,34 +490,3 @@ def test_the_audit_log_and_the_metrics_tell_of_tokens(service: Service) -> None:
     assert len({(line.actor, line.pseudonym) for line in lines}) == 1
     text = client.get("/metrics").text
     assert 'veilface_tokens_total{action="verify"}' in text
-    store = open_store(deployment.settings, open_keyring(deployment.settings))
-    try:
-        walk, records = store.verify_audit_log()
-        assert walk.intact
-        assert not records
-    finally:
-        store.close()
-
-
-def test_a_page_of_an_allowed_origin_uses_a_token(tmp_path: Path) -> None:
-    origin = "https://shop.example"
-    deployment = deploy(tmp_path, cors_origins=origin, lockout_after=0)
-    with Client(create_app(deployment.settings)) as client:
-        preflight = client.request(
-            "OPTIONS",
-            "/v1/subjects/alice/verify",
-            headers={
-                "Origin": origin,
-                "Access-Control-Request-Method": "POST",
-                "Access-Control-Request-Headers": "authorization, if-none-match",
-            },
-        )
-        assert preflight.status_code == 204
-        allowed = preflight.headers["access-control-allow-headers"].lower()
-        assert {"authorization", "if-none-match"} <= set(allowed.split(", "))
-        token = issue(client, headers=bearer(deployment.token))["token"]
-        answer = verify(client, token, headers={"Origin": origin})
-        assert answer.headers["access-control-allow-origin"] == origin
-        again = verify(client, token, headers={"Origin": origin})
-        assert_error(again, 401, "replayed")
-        assert again.headers["access-control-allow-origin"] == origin

@@ -23,9 +23,9 @@ from templates.store import TemplateStore
 from templates.store.database import Database
 from templates.store.evidence import COUNT_LIFTED, KEY_ALTERED, KEY_PUT_BACK
 from templates.store.receipts import Receipt, verify_receipt
+from tests.api.calls import AFTER, attempt, enroll, fail
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer
-from tests.api.http.test_lockout import AFTER, attempt, enroll, fail
 from tests.api.shapes import assert_error
 
 
