@@ -9,6 +9,7 @@ import time
 from collections import Counter
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from datetime import UTC, datetime
 from typing import Any
 
 import anyio
@@ -328,6 +329,24 @@ def test_tokens_count_for_the_key_that_made_them(tight: Deployment) -> None:
             ]
             assert [each.status_code for each in answers] == [200] * 2 + [429] * 2
             assert (await sent(app, "/v1/contract", **key)).status_code == 429
+
+    anyio.run(scenario)
+
+
+def test_a_late_token_uses_up_nothing_of_its_key(tight: Deployment) -> None:
+    key = bearer(tight.key("verify"))
+
+    async def scenario() -> None:
+        async with served(tight.settings) as app:
+            body = {"subject_id": "late", "action": "verify", "lifetime_s": 1}
+            issued = (await sent(app, "/v1/tokens", host="203.0.113.1", json=body, **key)).json()
+            while datetime.now(UTC) <= datetime.fromisoformat(issued["expires_at"]):
+                await anyio.sleep(0.1)
+            for number in range(2, 8):
+                token = bearer(issued["token"])
+                answer = await sent(app, "/v1/contract", host=f"203.0.113.{number}", **token)
+                assert_error(answer, 401, "replayed")
+            assert (await sent(app, "/v1/contract", host="203.0.113.8", **key)).status_code == 200
 
     anyio.run(scenario)
 
