@@ -24,7 +24,7 @@ import httpx
 from api.cli.calibration import calibrate_folder, default_probe_dims
 from api.demo.people import ENROLLED_PHOTOS, PROBE_PHOTOS, Cast, Scale, drawn_cast, found_cast
 from api.demo.service import running_service
-from api.demo.storage import KEY_FILE, Stored, read_stored, rows_of
+from api.demo.storage import KEY_FILE, Stored, create_key, read_stored, rows_of
 from api.http.errors import StartError
 from api.http.receipts import read_receipt_key, verify_answer
 from api.service.opening import file_sealer, weak_privacy
@@ -138,7 +138,7 @@ def run_demo(
         contract = _calibrate(folder, pack, decoy_photos, labelled, m=m, say=say)
     _write_settings(folder, pack, contract)
     say("starting the service")
-    with running_service(folder) as client:
+    with running_service(folder, create_key(folder)) as client:
         return _play(client, folder, pack, contract, cast, say=say, started=started)
 
 

@@ -19,40 +19,28 @@ START_TIMEOUT_S = 120.0
 
 
 @contextlib.contextmanager
-def running_service(folder: Path) -> Iterator[httpx.Client]:
-    """Start ``veilface serve`` on a free local port; a client with the bootstrap key.
+def running_service(folder: Path, token: str) -> Iterator[httpx.Client]:
+    """Start ``veilface serve`` on a free local port; a client with the API key ``token``.
 
     The service ends with the block, also where this process is ended by SIGTERM.
     """
     port = _free_port()
-    log, shown = folder / "serve.log", folder / "serve.out"
-    command = [
-        sys.executable,
-        "-P",
-        "-m",
-        "veilface",
-        "serve",
-        "--config",
-        str(folder / "veilface.toml"),
-    ]
+    log = folder / "serve.log"
+    settings = folder / "veilface.toml"
+    command = [sys.executable, "-P", "-m", "veilface", "serve"]
     # Settings of the person who runs the demo must not reach it.
     environment = {k: v for k, v in os.environ.items() if not k.startswith("VEILFACE_")}
-    shown.unlink(missing_ok=True)
-    # The first start prints a token with all rights: nobody else may read it on its way.
-    with log.open("wb") as errors, open(shown, "xb", opener=_privately) as output:
+    with log.open("wb") as output:
         before = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
         process = subprocess.Popen(  # noqa: S603 - our own command, no shell
-            [*command, "--config", str(folder / "veilface.toml"), "--port", str(port)],
+            [*command, "--config", str(settings), "--port", str(port)],
             stdout=output,
-            stderr=errors,
-            env={**environment, "PYTHONUNBUFFERED": "1"},
+            stderr=subprocess.STDOUT,
+            env=environment,
         )
         try:
             url = f"http://127.0.0.1:{port}"
             _await_ready(process, url, log)
-            token = next(line for line in shown.read_text().splitlines() if line.startswith("vf_"))
-            shown.unlink()
-            _write_token(folder / "api-key", token)
             headers = {"Authorization": f"Bearer {token}"}
             with httpx.Client(base_url=url, headers=headers, timeout=30.0) as client:
                 yield client
@@ -64,7 +52,6 @@ def running_service(folder: Path) -> Iterator[httpx.Client]:
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
-            shown.unlink(missing_ok=True)
 
 
 def _free_port() -> int:
@@ -84,12 +71,3 @@ def _await_ready(process: "subprocess.Popen[bytes]", url: str, log: Path) -> Non
                     return
             time.sleep(0.1)
     raise StartError(f"the service was not ready in {START_TIMEOUT_S:.0f} s; {log} says why")
-
-
-def _privately(path: str, flags: int) -> int:
-    return os.open(path, flags, 0o600)
-
-
-def _write_token(path: Path, token: str) -> None:
-    with open(path, "x", opener=_privately) as file:
-        file.write(token + "\n")

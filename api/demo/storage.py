@@ -1,17 +1,21 @@
-"""What the database's file holds after the demo."""
+"""The demo's database: its first API key, and what its file holds in the end."""
 
 import contextlib
 import sqlite3
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+from api.service.opening import prepare_database
 from templates.contract import wire
+from templates.keys.private_file import create_private
 from templates.keys.sealing import MasterKeyring
-from templates.store import TemplateStore
+from templates.store import Right, TemplateStore
 
 TENANT = "default"
 KEY_FILE = "master.key"
+_EXCERPT = 16
 
 
 @dataclass(frozen=True)
@@ -27,52 +31,56 @@ class Stored:
     ciphertext_excerpt: str
 
 
+def create_key(folder: Path) -> str:
+    """Make the database and an API key with all rights; its token, which ``api-key`` keeps."""
+    with contextlib.closing(_store(folder)) as store:
+        prepare_database(store)
+        store.tenants.create(TENANT)
+        token = store.api_keys.create(TENANT, tuple(Right), label="demo").token
+    create_private(folder / "api-key", f"{token}\n".encode())
+    return token
+
+
 def read_stored(folder: Path, names: Sequence[str]) -> tuple[Stored, ...]:
     """Read the database's file as a thief would, and open it with the master key beside that."""
-    url = f"sqlite:///{(folder / 'veilface.db').resolve()}"
-    store = TemplateStore(url, MasterKeyring.load(folder / KEY_FILE))
     stored = []
-    try:
+    with contextlib.closing(_store(folder)) as store:
         for name in names:
             subject = store.subjects.get(TENANT, name)
             if subject is None:
                 continue
-            foot_norm = wire.decode(subject.wire).subspace.foot_norm
-            ciphertext = _ciphertext(folder, name)
+            query = (
+                "SELECT t.ciphertext FROM templates t JOIN subjects s ON s.id = t.subject_pk "
+                "WHERE s.subject_id = ?"
+            )
+            ciphertext = bytes(_value(folder, query, name))
+            # From the middle: away from the header and the authentication tag.
+            start = (len(ciphertext) - _EXCERPT) // 2
             stored.append(
                 Stored(
                     name=name,
                     n=subject.record.n,
                     m=subject.record.m,
                     template_bytes=len(subject.wire),
-                    foot_norm=float(foot_norm),
+                    foot_norm=float(wire.decode(subject.wire).subspace.foot_norm),
                     ciphertext_bytes=len(ciphertext),
-                    ciphertext_excerpt=_middle(ciphertext).hex(),
+                    ciphertext_excerpt=ciphertext[start : start + _EXCERPT].hex(),
                 )
             )
-    finally:
-        store.close()
     return tuple(stored)
-
-
-def _ciphertext(folder: Path, name: str) -> bytes:
-    with contextlib.closing(sqlite3.connect(folder / "veilface.db")) as database:
-        row = database.execute(
-            "SELECT t.ciphertext FROM templates t JOIN subjects s ON s.id = t.subject_pk "
-            "WHERE s.subject_id = ?",
-            (name,),
-        ).fetchone()
-    return bytes(row[0])
-
-
-def _middle(data: bytes, count: int = 16) -> bytes:
-    """Cut some bytes from the middle: away from the header and the authentication tag."""
-    start = (len(data) - count) // 2
-    return data[start : start + count]
 
 
 def rows_of(folder: Path, name: str) -> int:
     """Count the rows that name a person in the clear."""
+    return int(_value(folder, "SELECT count(*) FROM subjects WHERE subject_id = ?", name))
+
+
+def _store(folder: Path) -> TemplateStore:
+    url = f"sqlite:///{(folder / 'veilface.db').resolve()}"
+    return TemplateStore(url, MasterKeyring.load(folder / KEY_FILE))
+
+
+def _value(folder: Path, query: str, name: str) -> Any:
+    """First column of a query's only row."""
     with contextlib.closing(sqlite3.connect(folder / "veilface.db")) as database:
-        query = "SELECT count(*) FROM subjects WHERE subject_id = ?"
-        return int(database.execute(query, (name,)).fetchone()[0])
+        return database.execute(query, (name,)).fetchone()[0]
