@@ -92,42 +92,34 @@ def test_hidden_leftovers_are_not_part_of_a_pack(tmp_path):
     assert ModelPack.load(folder).info.embedder_file == "emb.onnx"
 
 
-def test_two_embedders_are_named(tmp_path):
-    folder = write_pack(tmp_path, one=pooling_embedder(), two=pooling_embedder(128))
-    with pytest.raises(PackError, match=r"2 embedders: one\.onnx and two\.onnx; leave one"):
-        ModelPack.load(folder)
+SCRFD, BLIND, YUNET = (
+    graphs.scrfd_shapes(),
+    graphs.scrfd_shapes(keypoints=False),
+    graphs.yunet_shapes(),
+)
+ZEROS = graphs.shaped([("x", ["N", 3, 112, 112])], [("y", [1, 512])])
 
 
-def test_two_detectors_are_named(tmp_path):
-    folder = write_pack(
-        tmp_path, e=pooling_embedder(), s=graphs.scrfd_shapes(), y=graphs.yunet_shapes()
-    )
-    with pytest.raises(PackError, match=r"2 detectors: s\.onnx and y\.onnx"):
-        ModelPack.load(folder)
-
-
-def test_a_detector_without_keypoints_is_refused(tmp_path):
-    folder = write_pack(tmp_path, e=pooling_embedder(), d=graphs.scrfd_shapes(keypoints=False))
-    with pytest.raises(PackError, match=r"d\.onnx.*without keypoints"):
-        ModelPack.load(folder)
-
-
-def test_no_embedder_says_what_was_seen(tmp_path):
-    folder = write_pack(tmp_path, g=GENDER, d=graphs.yunet_shapes())
-    with pytest.raises(PackError, match=r"no embedder. Seen: d\.onnx: .*; g\.onnx: 96 x 96"):
-        ModelPack.load(folder)
-
-
-def test_a_broken_file_is_named(tmp_path):
-    folder = write_pack(tmp_path, e=pooling_embedder(), broken=b"oops")
-    with pytest.raises(PackError, match=r"broken\.onnx"):
-        ModelPack.load(folder)
-
-
-def test_an_embedder_that_does_not_embed_is_named(tmp_path):
-    fake = graphs.shaped([("x", ["N", 3, 112, 112])], [("y", ["N", 512])])
-    with pytest.raises(PackError, match=r"fake\.onnx"):
-        ModelPack.load(write_pack(tmp_path, fake=fake))
+@pytest.mark.parametrize(
+    ("files", "said"),
+    [
+        (
+            {"one": pooling_embedder(), "two": pooling_embedder(128)},
+            r"2 embedders: one\.onnx and two\.onnx; leave one",
+        ),
+        (
+            {"e": pooling_embedder(), "s": SCRFD, "y": YUNET},
+            r"2 detectors: s\.onnx and y\.onnx",
+        ),
+        ({"e": pooling_embedder(), "d": BLIND}, r"d\.onnx.*without keypoints"),
+        ({"g": GENDER, "d": YUNET}, r"no embedder. Seen: d\.onnx: .*; g\.onnx: 96 x 96"),
+        ({"e": pooling_embedder(), "broken": b"oops"}, r"broken\.onnx"),
+        ({"fake": ZEROS}, r"fake\.onnx"),
+    ],
+)
+def test_a_pack_that_cannot_be_used_is_refused_by_its_files(tmp_path, files, said):
+    with pytest.raises(PackError, match=said):
+        ModelPack.load(write_pack(tmp_path, **files))
 
 
 def test_an_absent_accelerator_is_refused(tmp_path):
