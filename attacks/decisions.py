@@ -68,18 +68,3 @@ def score(
 def fmr_of(level: Level) -> float:
     """Return what a stranger reaches at a level: its FMR."""
     return level.fmr.value if level.target_fmr is None else level.target_fmr
-
-
-def decide(
-    probes: Probes,
-    templates: SubspaceBatch,
-    nobody: Nobody,
-    calibration: Calibration,
-    level: Level,
-    *,
-    paired: bool = False,
-    cohort: SubspaceBatch | None = None,
-) -> NDArray[np.bool_]:
-    """Decide at one level; see :func:`score`."""
-    scores = score(probes, templates, nobody, calibration, paired=paired, cohort=cohort)
-    return scores.at(level)

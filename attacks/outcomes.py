@@ -131,11 +131,6 @@ class Scheme:
     dim: int
     axes: int | None = None
 
-    @property
-    def order(self) -> tuple[str, str, int]:
-        """Sort key."""
-        return self.strategy, self.decoys or "", self.dim
-
     def __str__(self) -> str:
         if self.strategy == RAW:
             return "raw embeddings"

@@ -23,7 +23,6 @@ from api.cli.options import (
 from api.cli.results import Plan
 from api.service.opening import file_sealer, open_keyring
 from api.settings import Settings
-from attacks.attributes.attackers import TRAINED
 from attacks.attributes.audit import (
     AttributeAuditPlan,
     attribute_outcomes,
@@ -31,6 +30,7 @@ from attacks.attributes.audit import (
     labelled_faces,
     run_attribute_audit,
 )
+from attacks.attributes.experiment import KNN, LOGISTIC
 from attacks.attributes.plan import OUR_DIMS, PAPER_DIMS, AttributePlan, schemes_of
 from attacks.outcomes import GENERATED, RAW_SCHEME, Scheme
 from attacks.population import LEAST_FITTED
@@ -51,8 +51,7 @@ STRATEGIES = (
     Strategy.HYBRID,
     Strategy.HYBRID_PLUS,
 )
-KNN = "knn"
-ATTACKERS = (KNN, *TRAINED)
+ATTACKERS = (KNN, LOGISTIC)
 
 
 @takes_settings(*BULK)
@@ -100,7 +99,7 @@ def fairface(
         ),
     ] = ",".join(map(str, OUR_DIMS)),
     attackers: Annotated[str, typer.Option(help="Who attacks; `knn` is the paper's.")] = ",".join(
-        (KNN, *AttributePlan().attackers)
+        ATTACKERS
     ),
     neighbours: Annotated[int, typer.Option("--k", min=1, help="Neighbours of `knn`.")] = 10,
     drop_duplicates: Annotated[
@@ -187,13 +186,13 @@ def fairface(
         for scheme in grid
         if scheme.decoys == GENERATED or scheme.strategy in {*strategies, RAW_SCHEME.strategy}
     ]
-    trained = [name for name in listed_names(attackers, ATTACKERS, "--attackers") if name != KNN]
+    trained = LOGISTIC in listed_names(attackers, ATTACKERS, "--attackers")
     audited = Scheme(str(Strategy.ADVERSARIAL), GENERATED, service_dim, axes)
     labels = fairface_labels(root, "train"), fairface_labels(root, "val")
     plan = AttributeAuditPlan(
         schemes=tuple(schemes),
         attributes=wanted,
-        attackers=AttributePlan(k=neighbours, attackers=tuple(trained)),
+        attackers=AttributePlan(k=neighbours, trained=trained),
         lifting=default_lifting(len(labels[0])) if lifting is None else lifting,
         attack=attack,
         attacked=attacked,

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from attacks.attributes.attackers import TRAINED, TrainingSet
+from attacks.attributes.attackers import Logistic, TrainingSet
 from attacks.attributes.features import Features
-from attacks.attributes.known_decoys import Flags
 from attacks.attributes.measures import InferenceMeasures, measure
 from attacks.attributes.observations import (
     ByAttribute,
@@ -24,7 +23,7 @@ from templates.distances import Metric
 
 ByClass = Mapping[str, NDArray[np.float64]]
 
-_KNN, _SECOND, _STRIP, _RULE = "knn", "second moments", "strip", "rule"
+KNN, LOGISTIC, SECOND, STRIP = "knn", "logistic", "second moments", "strip"
 
 
 def run_scheme(setup: Setup, scheme: Scheme) -> list[AttributeRow]:
@@ -65,30 +64,25 @@ def run_scheme(setup: Setup, scheme: Scheme) -> list[AttributeRow]:
     predictions: list[_Predictions] = [
         # The vote learns from no template, so that all of the attacker's own try it.
         _Predictions(
-            _KNN, metric, KnowledgeLevel.ALGORITHM, victims.votes[metric], own.votes[metric]
+            KNN, metric, KnowledgeLevel.ALGORITHM, victims.votes[metric], own.votes[metric]
         )
         for metric in victims.votes
     ]
     truths = training.truth, validation.truth
     features = training.features, validation.features, victims.features
-    for name in setup.plan.attackers:
-        attacked, held_out, seconds = _trained(setup, name, features, truths)
-        choices = _chosen(attacked), _chosen(held_out)
-        predictions.append(_Predictions(name, None, KnowledgeLevel.ALGORITHM, *choices, seconds))
+    if setup.plan.trained:
+        choices = _trained(setup, features, truths)
+        predictions.append(_Predictions(LOGISTIC, None, KnowledgeLevel.ALGORITHM, *choices))
     if not (victims.guessed is None or training.guessed is None or validation.guessed is None):
-        name, knowledge = _SECOND, KnowledgeLevel.ALGORITHM
+        name, knowledge = SECOND, KnowledgeLevel.ALGORITHM
         if scheme.decoys == POOLED:
-            name, knowledge = _STRIP, KnowledgeLevel.DECOYS
+            name, knowledge = STRIP, KnowledgeLevel.DECOYS
         features = training.guessed, validation.guessed, victims.guessed
-        attacked, held_out, seconds = _trained(setup, "svm", features, truths)
-        choices = _chosen(attacked), _chosen(held_out)
-        predictions.append(_Predictions(name, None, knowledge, *choices, seconds))
-        if victims.absent:
-            choices = _among(attacked, victims.absent), _among(held_out, validation.absent)
-            predictions.append(_Predictions(_RULE, None, knowledge, *choices, seconds))
+        choices = _trained(setup, features, truths, foot=True)
+        predictions.append(_Predictions(name, None, knowledge, *choices))
     rows: list[AttributeRow] = []
     for prediction in predictions:
-        held_out_truth = own.truth if prediction.attacker == _KNN else validation.truth
+        held_out_truth = own.truth if prediction.attacker == KNN else validation.truth
         rows += _rows(setup, scheme, prediction, victims.truth, held_out_truth)
     return rows
 
@@ -107,31 +101,22 @@ class _Predictions:
 
 def _trained(
     setup: Setup,
-    attacker: str,
     features: tuple[Features, Features, Features],
     truths: tuple[ByAttribute, ByAttribute],
-) -> tuple[ByClass, ByClass, float]:
-    """Train an attacker; its scores of the attacked and of the held-out faces, and its seconds.
+    *,
+    foot: bool = False,
+) -> tuple[ByAttribute, ByAttribute, float]:
+    """Train an attacker; its predictions of the attacked and of the held-out faces, and seconds.
 
     ``features`` are of the training, the held-out and the attacked faces, ``truths`` of the first
     two.
     """
     start = time.perf_counter()
     training, held_out, attacked = features
-    rows = np.arange(len(training))
-    if attacker == "svm" and len(rows) > setup.plan.kernel_most:
-        rng = np.random.default_rng([setup.seed, 2])
-        rows = np.sort(rng.permutation(len(rows))[: setup.plan.kernel_most])
-    model = TRAINED[attacker](
-        TrainingSet(
-            training.take(rows),
-            {name: codes[rows] for name, codes in truths[0].items()},
-            held_out,
-            truths[1],
-            {name: len(classes) for name, classes in setup.split.attack.classes.items()},
-        )
-    )
-    return model.scores(attacked), model.scores(held_out), time.perf_counter() - start
+    classes = {name: len(of) for name, of in setup.split.attack.classes.items()}
+    model = Logistic(TrainingSet(training, truths[0], held_out, truths[1], classes), foot=foot)
+    made = _chosen(model.scores(attacked)), _chosen(model.scores(held_out))
+    return *made, time.perf_counter() - start
 
 
 def _rows(
@@ -170,10 +155,3 @@ def _rows(
 
 def _chosen(scores: ByClass) -> ByAttribute:
     return {name: np.argmax(values, axis=1).astype(np.int64) for name, values in scores.items()}
-
-
-def _among(scores: ByClass, allowed: Mapping[str, Flags]) -> ByAttribute:
-    """Choose among some classes of each face only, of the attributes that have such."""
-    return _chosen(
-        {name: np.where(flags, scores[name], -np.inf) for name, flags in allowed.items()}
-    )

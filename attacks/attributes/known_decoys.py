@@ -81,22 +81,3 @@ def strip(templates: SubspaceBatch, pool: Array32, decoys: Decoys) -> Array32:
     for _ in range(2):  # once more removes what rounding left
         feet -= (left @ (left.transpose(0, 2, 1) @ feet[:, :, None]))[:, :, 0]
     return normalised(feet).astype(np.float32)
-
-
-def never_seen(decoys: Decoys, labels: Codes, classes: int) -> Flags:
-    """Classes that no decoy of a template has: hybrid+ leaves the person's own out.
-
-    Parameters
-    ----------
-    labels : (W,) int64
-        Class numbers of the pool's entries.
-
-    Returns
-    -------
-    bool, shape (P, classes)
-        All true where the decoys have all classes, and the rule says nothing.
-    """
-    decoy_labels = np.where(decoys.found, labels[decoys.entries], -1)
-    absent = np.stack([(decoy_labels != code).all(axis=1) for code in range(classes)], axis=1)
-    absent[~absent.any(axis=1)] = True
-    return np.asarray(absent)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from attacks.attributes.faces import LabelledFaces
 from attacks.attributes.features import Features, features_of
-from attacks.attributes.known_decoys import Flags, find_decoys, never_seen, strip
+from attacks.attributes.known_decoys import find_decoys, strip
 from attacks.attributes.neighbours import METRICS, Attacked, merged, nearest_neighbours, vote
 from attacks.attributes.plan import Setup, Side
 from attacks.errors import AuditError
@@ -45,8 +45,6 @@ class Observations:
     guessed: Features | None
     """Features of the guesses at the embeddings, of attackers who know the decoys: the foot points
     without the pool's, or the points likeliest by second moments; None where there are none."""
-    absent: dict[str, Flags]
-    """Classes that no decoy has (hybrid+)."""
     truth: ByAttribute
 
     def take(self, rows: Codes) -> "Observations":
@@ -55,7 +53,6 @@ class Observations:
             self.features.take(rows),
             {m: {a: codes[rows] for a, codes in by.items()} for m, by in self.votes.items()},
             None if self.guessed is None else self.guessed.take(rows),
-            {a: flags[rows] for a, flags in self.absent.items()},
             {a: codes[rows] for a, codes in self.truth.items()},
         )
 
@@ -71,7 +68,6 @@ class Observations:
                 for m, by in first.votes.items()
             },
             Features.stack(guessed) if guessed else None,
-            {a: np.concatenate([part.absent[a] for part in parts]) for a in first.absent},
             {a: np.concatenate([part.truth[a] for part in parts]) for a in first.truth},
         )
 
@@ -172,8 +168,8 @@ def _observe_tile(
         }
         for metric, neighbours in near.items()
     }
-    guessed, absent = _guessed(observer, attacked, features, own)
-    return Observations(features, votes, guessed, absent, dict(faces.labels))
+    guessed = _guessed(observer, attacked, features, own)
+    return Observations(features, votes, guessed, dict(faces.labels))
 
 
 def _lifted(
@@ -206,37 +202,22 @@ def _lifted(
 
 def _guessed(
     observer: _Observer, attacked: Attacked, features: Features, own: Codes | None
-) -> tuple[Features | None, dict[str, Flags]]:
-    """Guess the descriptors of whoever knows the pool or the generator.
-
-    Of the pool's decoys also which classes they leave out (hybrid+).
-    """
+) -> Features | None:
+    """Guess the embeddings, with the pool or with the generator."""
     scheme, side = observer.scheme, observer.side
     if scheme.decoys is None or not isinstance(attacked, SubspaceBatch):
-        return None, {}
+        return None
     if scheme.decoys == GENERATED:
         known = observer.setup.decoys
         if side.faces is None or known is None:
             raise AuditError("schemes with generated decoys need a decoy generator")
         points = likeliest_embeddings(attacked, side.faces, known).astype(np.float32)
         point_features = _features_of_points(observer, points)
-        return Features(points, np.hstack([point_features.derived, features.derived])), {}
-    strategy = Strategy(scheme.strategy)
-    entries = side.entries
-    decoys = find_decoys(
-        attacked,
-        entries.descriptors,
-        most=strategy.decoys(scheme.dim),
-        skip=own,
-    )
-    point_features = _features_of_points(observer, strip(attacked, entries.descriptors, decoys))
-    if strategy is not Strategy.HYBRID_PLUS:
-        return point_features, {}
-    absent = {
-        name: never_seen(decoys, entries.labels[name], len(entries.classes[name]))
-        for name in ("gender", "race")
-    }
-    return point_features, absent
+        return Features(points, np.hstack([point_features.derived, features.derived]))
+    entries = side.entries.descriptors
+    most = Strategy(scheme.strategy).decoys(scheme.dim)
+    decoys = find_decoys(attacked, entries, most=most, skip=own)
+    return _features_of_points(observer, strip(attacked, entries, decoys))
 
 
 def _features_of_points(observer: _Observer, points: NDArray[np.float32]) -> Features:

@@ -31,8 +31,8 @@ class AttributePlan:
 
     Parameters
     ----------
-    attackers
-        Of `attackers.TRAINED`.
+    trained
+        Train attackers beside the paper's.
     lifts
         Times that the attacker lifts each of its own faces to train on. None for as many as
         ``training_most`` allows, 1 to 3: labels are scarce, and lifting is free.
@@ -40,8 +40,6 @@ class AttributePlan:
         Trained attackers see the neighbours among at most so many random faces of the gallery, of
         their own templates and of the attacked ones alike. The paper's attacker searches all of the
         attacker's faces for an attacked template.
-    kernel_most
-        At most so many lifted faces train the kernel machine, whose time grows with the cube.
     folds
         Parts of the attacker's faces; a face is lifted with decoys of its own part and judged by
         axes and neighbours of the other parts.
@@ -56,11 +54,10 @@ class AttributePlan:
 
     k: int = 10
     feature_ks: tuple[int, ...] = (10, 50)
-    attackers: tuple[str, ...] = ("logistic", "svm")
+    trained: bool = True
     lifts: int | None = None
     training_most: int = 10_000
     gallery_most: int = 10_000
-    kernel_most: int = 5_000
     folds: int = 4
     held_out: float = 0.2
     threads: int = 2

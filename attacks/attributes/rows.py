@@ -16,10 +16,9 @@ class AttributeRow:
     Parameters
     ----------
     attacker
-        ``knn`` (the paper's), ``logistic`` or ``svm`` (trained on faces that the attacker lifted),
-        ``second moments`` (``svm`` with the point that is likeliest to be the embedding, given
-        what the generator's decoys do), ``strip`` (known decoys removed, then ``svm``), ``rule``
-        (``strip`` among the classes that hybrid+ shows by leaving them out).
+        ``knn`` (the paper's), ``logistic`` (a regression on faces that the attacker lifted),
+        ``second moments`` (the same with the point that is likeliest to be the embedding, given
+        what the generator's decoys do), ``strip`` (with what is left without the known decoys).
     metric
         That neighbours were searched by; None where both or none were.
     knowledge

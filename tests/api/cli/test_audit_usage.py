@@ -25,7 +25,7 @@ FAIRFACE_USAGE: list[tuple[list[str], str]] = [
     (["--attributes", "gender,height"], "--attributes takes of gender, race, age, not"),
     (["--attributes", ","], "--attributes takes of gender, race, age, and is empty"),
     (["--strategy", "raw,homomorphic"], "--strategy takes of raw, random, adversarial, hybrid"),
-    (["--attackers", "knn,oracle"], "--attackers takes of knn, logistic, svm"),
+    (["--attackers", "knn,oracle"], "--attackers takes of knn, logistic, not"),
     (["--dim", "two"], "--dim takes whole numbers such as 2,4, not 'two'"),
     (["--dim", "2,256"], "--dim takes dimensions from 1 to 255, not 256"),
     (["--dim", "0"], "--dim takes dimensions from 1 to 255, not 0"),

@@ -35,7 +35,7 @@ def plan(strategy: str, m: int) -> AttributeAuditPlan:
     return AttributeAuditPlan(
         schemes=(RAW_SCHEME, Scheme(strategy, "pool", m)),
         attributes=("gender",),
-        attackers=AttributePlan(feature_ks=(10,), lifts=1, attackers=()),
+        attackers=AttributePlan(feature_ks=(10,), lifts=1, trained=False),
         lifting=110,
         attack=120,
         attacked=30,
@@ -70,7 +70,7 @@ def row(
 
 def raw(attribute: str = "gender") -> AttributeRow:
     """Raw embeddings tell 180 of 200: a gain of 0.4 over the larger class."""
-    return row(RAW_SCHEME, "svm", 180, held_out=0.4, attribute=attribute)
+    return row(RAW_SCHEME, "logistic", 180, held_out=0.4, attribute=attribute)
 
 
 def only(rows: list[AttributeRow]) -> AttackOutcome:
@@ -84,11 +84,11 @@ def test_the_attacker_who_was_strongest_at_home_is_quoted_and_not_the_luckiest()
     outcome = only(
         [
             row(SERVICE, "knn", 110, held_out=0.02),
-            row(SERVICE, "svm", 120, held_out=0.2),
+            row(SERVICE, "logistic", 120, held_out=0.2),
             row(SERVICE, "logistic", 150, held_out=0.1),
         ]
     )
-    assert (outcome.attack, outcome.variant) == (ATTACK, "gender by svm")
+    assert (outcome.attack, outcome.variant) == (ATTACK, "gender by logistic")
     assert (outcome.measured.value, outcome.chance) == (0.6, 0.5)
     assert (outcome.measured.ci_low, outcome.measured.ci_high) == wilson(120, FACES)
     assert outcome.measured.trials == FACES
@@ -151,7 +151,7 @@ def test_predictions_that_know_nothing_are_no_leakage(deal: np.ndarray) -> None:
     truth = chance.choice(9, p=AGES, size=1500)
     guesses = chance.choice(9, p=deal, size=1500)
     found = measure(guesses, truth, training=truth, classes=9, seed=0)
-    blind = replace(row(SERVICE, "svm", 100, held_out=0.1, attribute="age"), measures=found)
+    blind = replace(row(SERVICE, "logistic", 100, held_out=0.1, attribute="age"), measures=found)
     outcome = only([blind])
     # The majority of 0.30 is far above what such predictions find.
     assert found.advantage < -0.08
@@ -167,13 +167,13 @@ def test_predictions_that_know_nothing_are_no_leakage(deal: np.ndarray) -> None:
 
 
 def test_what_raw_embeddings_do_not_tell_is_not_judged_and_without_them_nothing_is() -> None:
-    nothing = row(RAW_SCHEME, "svm", 100, held_out=0.0)
+    nothing = row(RAW_SCHEME, "logistic", 100, held_out=0.0)
     outcomes = attribute_outcomes(
-        [nothing, row(SERVICE, "svm", 150, held_out=0.1)], audited=SERVICE
+        [nothing, row(SERVICE, "logistic", 150, held_out=0.1)], audited=SERVICE
     )
     assert outcomes[1].unjudged == "raw embeddings do not tell it either"
     with pytest.raises(AuditError, match="add `raw`"):
-        attribute_outcomes([row(SERVICE, "svm", 150, held_out=0.1)], audited=SERVICE)
+        attribute_outcomes([row(SERVICE, "logistic", 150, held_out=0.1)], audited=SERVICE)
 
 
 def test_an_audit_reports_its_progress_and_the_sizes_of_its_parts() -> None:

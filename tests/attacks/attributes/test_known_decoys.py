@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from attacks.attributes.known_decoys import TOUCH, Decoys, find_decoys, never_seen, strip
+from attacks.attributes.known_decoys import TOUCH, find_decoys, strip
 from templates.decoys import DecoyPool
 from templates.keys.randomness import Keystream
 from templates.space.lifting import lift
@@ -87,20 +87,6 @@ def test_the_face_itself_is_no_decoy() -> None:
     found = find_decoys(templates, pool, most=4, skip=own)
     assert found.found.all()
     assert not (found.entries == own[:, None]).any()
-
-
-def test_never_seen_are_the_classes_left_out() -> None:
-    labels = np.array([0, 1, 2, 1])
-    found = np.array([[True, True], [True, False], [True, True], [False, False]])
-    decoys = Decoys(np.array([[0, 1], [2, 0], [1, 3], [0, 1]]), found)
-    assert never_seen(decoys, labels, 3).tolist() == [
-        [False, False, True],
-        [True, True, False],
-        [True, False, True],
-        [True, True, True],
-    ]
-    both = Decoys(np.array([[0, 1]]), np.array([[True, True]]))
-    assert never_seen(both, labels, 2).tolist() == [[True, True]]
 
 
 def test_the_threshold_is_far_from_both_sides() -> None:

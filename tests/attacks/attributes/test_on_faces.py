@@ -48,7 +48,7 @@ def by_attacker(setup: Setup, scheme: Scheme) -> dict[tuple[str, str], Attribute
 
 def test_random_lifting_conceals_nothing(setup: Setup) -> None:
     raw, lifted = (by_attacker(setup, s) for s in (RAW_SCHEME, Scheme("random", None, 4)))
-    for attacker in ("knn", "logistic", "svm"):
+    for attacker in ("knn", "logistic"):
         before, after = raw[attacker, "gender"], lifted[attacker, "gender"]
         assert before.measures.leakage is after.measures.leakage is Leakage.ABOVE
         assert abs(before.accuracy - after.accuracy) < 0.08
@@ -57,18 +57,14 @@ def test_random_lifting_conceals_nothing(setup: Setup) -> None:
 def test_adversarial_lifting_conceals_from_all_but_who_holds_the_pool(setup: Setup) -> None:
     raw = by_attacker(setup, RAW_SCHEME)
     found = by_attacker(setup, Scheme("adversarial", POOLED, 16))
-    for attacker in ("knn", "logistic", "svm"):
+    for attacker in ("knn", "logistic"):
         assert found[attacker, "gender"].accuracy < raw[attacker, "gender"].accuracy - 0.15
-    low = raw["svm", "gender"].measures.accuracy.ci_low
+    low = raw["logistic", "gender"].measures.accuracy.ci_low
     assert found["strip", "gender"].accuracy > low
     assert found["strip", "gender"].measures.leakage is Leakage.ABOVE
 
 
-def test_the_rule_beats_the_neighbours_on_hybrid_plus(setup: Setup) -> None:
+def test_training_turns_round_what_neighbours_show_below_chance(setup: Setup) -> None:
     found = by_attacker(setup, Scheme("hybrid+", POOLED, 8))
     assert found["knn", "gender"].measures.leakage is Leakage.BELOW
-    assert found["rule", "gender"].accuracy == 1.0
-    assert found["rule", "race"].accuracy > found["knn", "race"].accuracy + 0.2
-    # Without the pool: what neighbours show below chance, training turns round.
-    strongest = max(found[name, "gender"].accuracy for name in ("logistic", "svm"))
-    assert strongest > 1 - found["knn", "gender"].accuracy - 0.05
+    assert found["logistic", "gender"].accuracy > 1 - found["knn", "gender"].accuracy - 0.05

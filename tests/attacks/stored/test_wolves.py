@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from attacks.decisions import decide
+from attacks.decisions import score
 from attacks.point_ascent import ascend_points
 from attacks.stored.nearest_neighbour import best_of, nearest_entries, nearest_points
 from attacks.stored.stolen_template import flats_inside, points_inside
@@ -55,9 +55,8 @@ def test_climbing_raises_the_share_that_accepts() -> None:
     def accepted(probes: np.ndarray | SubspaceBatch, lifted: bool) -> float:
         calibration = bed.lifted if lifted else bed.points
         assert calibration is not None
-        return float(
-            decide(probes, own.targets, bed.nobody, calibration, rule, cohort=cohort).mean()
-        )
+        found = score(probes, own.targets, bed.nobody, calibration, cohort=cohort)
+        return float(found.at(rule).mean())
 
     assert accepted(ends, False) > accepted(starts, False)
     assert bed.lifted is not None
