@@ -1,6 +1,5 @@
 """`veilface evaluate` on a part of LFW with real weights, where they are present."""
 
-import pickle
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +11,6 @@ from models.decoding import decode_image
 from models.pack import ModelPack
 from models.synthetic import encode_photo
 from tests.api.cli.conftest import Ran, run
-from tests.api.cli.test_evaluate import numbers
 
 pytestmark = pytest.mark.long
 
@@ -154,23 +152,6 @@ def test_lifted_rows_have_the_order_of_the_paper(part: Part) -> None:
         assert auc["adversarial", 8, "s2s", metric] < auc["adversarial", 2, "s2s", metric]
         assert auc["adversarial", 8, "s2s", metric] < auc["adversarial", 8, "p2s", metric]
     assert auc["adversarial", 8, "s2s", "euclidean"] < auc["adversarial", 8, "s2s", "spherical"]
-
-
-def test_a_bin_of_the_crops_gives_identical_numbers(part: Part, tmp_path: Path) -> None:
-    photos = [photo.read_bytes() for a, b, _ in part.pairs for photo in (a, b)]
-    same = [one for *_, one in part.pairs]
-    # As the published files are: arrays of bytes, by a Python 2 protocol.
-    arrays = [np.frombuffer(photo, np.uint8) for photo in photos]
-    (tmp_path / "part.bin").write_bytes(pickle.dumps((arrays, same), protocol=2))
-    ran = run(
-        *("evaluate", tmp_path / "part.bin", "--pack", part.pack, "--decoys", part.decoys),
-        *("--data-dir", part.data, "--cache", part.data / "cache.veil", *PLAN),
-        *("--strategy", "raw,random,adversarial", "--out", tmp_path / "out"),
-    )
-    assert ran.status == 0, ran.stderr
-    for block in ("rows", "runs", "curves"):
-        wanted = [row for row in part.ran.json[block] if row["strategy"] != "raw+flip"]
-        assert numbers(ran.json[block]) == numbers(wanted)
 
 
 def test_photos_are_detected_and_one_without_a_face_is_listed(
