@@ -138,42 +138,29 @@ class Settings(BaseSettings):
         0,
         ge=0,
         le=1024,
-        description="Requests that may compute at the same time in one worker; the others "
-        "wait. 0: one for each processor that the "
-        "process may use.",
+        description="Requests of one API key that may compute at the same time in one worker, and "
+        "half of those of all keys; the others wait. 0: one for each processor that the process "
+        "may use.",
     )
     queue_limit: int = Field(
         32,
         ge=1,
         le=100_000,
         description="Requests with a body that may send it or wait for a compute slot in one "
-        "worker; further ones are answered `overloaded`. One API key gets three quarters of the "
-        "places at most. With `max_request_bytes` it bounds the memory for bodies.",
-    )
-    max_in_flight: int = Field(
-        512,
-        ge=1,
-        le=100_000,
-        description="Requests of all kinds that one worker answers at the same time; further ones "
-        "are answered `overloaded` before anything of them is read.",
+        "worker; further ones are answered `overloaded`. One API key gets half of the places "
+        "at most. With `max_request_bytes` it bounds the memory for bodies.",
     )
     workers: int = Field(1, ge=1, le=256, description="Server processes.")
     host: str = Field("127.0.0.1", description="Address to listen on.")
     port: int = Field(8421, ge=0, le=65535, description="Port to listen on; 0 takes a free one.")
-    operations_host: str = Field(
-        "127.0.0.1", description="Address that `operations_port` is opened on."
-    )
-    operations_port: int | None = Field(
-        None,
-        ge=0,
-        le=65535,
-        description="Port for `/metrics` and `/health/*`, which the main port then answers "
-        "`not_found`; 0 takes a free one. Unset: they are on the main port, open to everybody "
-        "who reaches it.",
+    open_metrics: bool = Field(
+        False,
+        description="Answer `/metrics` to everybody who reaches the port. Otherwise it needs an "
+        "API key with the right `metrics`.",
     )
     tls_certificate: Path | None = Field(
         None,
-        description="PEM file with the certificate chain for TLS on the main port. Unset: plain "
+        description="PEM file with the certificate chain for TLS on the port. Unset: plain "
         "HTTP, for a reverse proxy on the same machine.",
     )
     tls_key: Path | None = Field(
@@ -389,13 +376,6 @@ class Settings(BaseSettings):
                 "https://HOST:PORT, in lower case, without a path, the scheme's own port or *"
             )
         return ",".join(origins)
-
-    @field_validator("operations_port")
-    @classmethod
-    def _apart(cls, value: int | None, info: ValidationInfo) -> int | None:
-        if value and value == info.data.get("port"):
-            raise ValueError("must differ from port")
-        return value
 
     @field_validator("tls_key")
     @classmethod

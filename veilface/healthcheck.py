@@ -18,8 +18,6 @@ TIMEOUT_S = 4.0
 DEFAULTS: dict[str, Any] = {
     "host": "127.0.0.1",
     "port": 8421,
-    "operations_host": "127.0.0.1",
-    "operations_port": None,
     "tls_certificate": None,
 }
 """Of :class:`api.settings.Settings`."""
@@ -46,10 +44,8 @@ def connection() -> http.client.HTTPConnection:
     name, and this machine is asked about itself.
     """
     known = settings()
-    apart = known["operations_port"] is not None
-    host, port = (known[f"operations_{name}" if apart else name] for name in ("host", "port"))
-    host = EVERY_ADDRESS.get(host, host)
-    if apart or known["tls_certificate"] is None:
+    host, port = EVERY_ADDRESS.get(known["host"], known["host"]), known["port"]
+    if known["tls_certificate"] is None:
         return http.client.HTTPConnection(host, int(port), timeout=TIMEOUT_S)
     unchecked = ssl._create_unverified_context()  # noqa: S323 - see above
     return http.client.HTTPSConnection(host, int(port), timeout=TIMEOUT_S, context=unchecked)

@@ -1,11 +1,9 @@
 """``veilface serve``: the REST service."""
 
 import signal
-import socket
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
-from functools import partial
+from contextlib import contextmanager
 from typing import Annotated
 
 import typer
@@ -15,13 +13,10 @@ from api.cli.errors import CommandError
 from api.cli.options import takes_settings
 from api.cli.verdict import private_mode_weakness, verdict_lines
 from api.limits.rates import RateLimits
-from api.service.metrics import shared_directory
 from api.service.opening import key_beside_database, require_privacy
-from api.service.operations import tls_options
 from api.service.runtime import Runtime
-from api.service.supervisor import run_server
+from api.service.server import listen, run_server, tls_options
 from api.settings import Settings
-from models.sessions import resolve_providers
 from templates.contract.document import Contract
 from templates.decoys import DecoyGenerator
 from templates.store import TemplateStore
@@ -45,21 +40,21 @@ def serve(
     Example: `veilface serve --pack buffalo_l --data-dir veilface-data --workers 2`
     """
     with _ended_by_sigterm():
-        contract, demo = _opened_once(settings, check=check)
-        if demo and not settings.demo:
+        contract = _check(settings, first_key=not check)
+        binding = contract.binding
+        if demo_notice(binding.embedder_sha256, n=binding.n) and not settings.demo:
             settings = settings.model_copy(update={"demo": True})
         if check:
             say("Everything fits together: contract, decoys, pack, database and master key.")
             return
-        settings = _with_ports(settings)
-        # Workers count together in a folder; a single process counts in its memory.
-        counting = nullcontext() if settings.workers == 1 else shared_directory()
-        try:
-            with counting:
-                run_server(settings, contract, on_ready=partial(_say_where, settings))
-        except SystemExit as error:
-            if error.code:
-                raise CommandError("the service did not start; its log says why") from None
+        with listen(settings) as listener:
+            port = listener.getsockname()[1]
+            message(f"Veilface listens on {service_url(settings, port=port)}")
+            try:
+                run_server(settings, contract, listener)
+            except SystemExit as error:
+                if error.code:
+                    raise CommandError("the service did not start; its log says why") from None
 
 
 @contextmanager
@@ -72,54 +67,21 @@ def _ended_by_sigterm() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-def _say_where(settings: Settings) -> None:
-    if settings.operations_port is not None:
-        operations = _address(settings.operations_host, settings.operations_port)
-        message(f"Health and metrics are on http://{operations}")
-    message(f"Veilface listens on {service_url(settings)}")
-
-
-def service_url(settings: Settings) -> str:
-    """Where the service of some settings answers."""
+def service_url(settings: Settings, *, port: int | None = None) -> str:
+    """Where the service of some settings answers; ``port`` is the one that was free, for 0."""
     scheme = "http" if settings.tls_certificate is None else "https"
-    return f"{scheme}://{_address(settings.host, settings.port)}"
+    host = f"[{settings.host}]" if ":" in settings.host else settings.host
+    return f"{scheme}://{host}:{port or settings.port}"
 
 
-def _with_ports(settings: Settings) -> Settings:
-    """Choose the free ports that are asked for by 0: all workers must open the same."""
-    chosen = {"port": free_port(settings.host, settings.port)}
-    if settings.operations_port is not None:
-        chosen["operations_port"] = free_port(
-            settings.operations_host, settings.operations_port, option="operations-"
-        )
-    return settings.model_copy(update=chosen)
-
-
-def _address(host: str, port: int) -> str:
-    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
-
-
-def _opened_once(settings: Settings, *, check: bool) -> tuple[Contract, bool]:
-    """Open everything and let go of it again, models included, before the workers open theirs.
+def _check(settings: Settings, *, first_key: bool) -> Contract:
+    """Open everything, models included, say what an operator should know, and let go of it again.
 
     The first API key is made and shown where there is none, unless this is a mere check.
-
-    Returns
-    -------
-    contract : Contract
-        The one that workers serve.
-    demo : bool
-        Whether the embedder is the demo model.
     """
     tls_options(settings)
     RateLimits.open(settings)
-    if check or settings.workers == 1 or settings.pack is None:
-        opened = settings
-    else:
-        # What an accelerator's library has begun does not survive a fork: it begins in the workers.
-        resolve_providers(settings.providers)
-        opened = settings.model_copy(update={"providers": ("cpu",)})
-    runtime = Runtime.open(opened)
+    runtime = Runtime.open(settings)
     if warning := key_beside_database(settings):
         message(f"warning: {warning}")
     try:
@@ -130,10 +92,9 @@ def _opened_once(settings: Settings, *, check: bool) -> tuple[Contract, bool]:
         browsers_lift = settings.serve_pack and isinstance(runtime.source, DecoyGenerator)
         if browsers_lift and (weakness := private_mode_weakness(runtime.contract)) is not None:
             message(f"warning: private mode: {weakness}")
-        binding = runtime.contract.binding
-        if not check:
+        if first_key:
             _show_first_key(runtime.store, settings)
-        return runtime.contract, bool(demo_notice(binding.embedder_sha256, n=binding.n))
+        return runtime.contract
     finally:
         runtime.close()
 
@@ -143,24 +104,3 @@ def _show_first_key(store: TemplateStore, settings: Settings) -> None:
     if made is not None:
         said = f"API key with all rights of tenant {settings.default_tenant}, shown only now:"
         say(f"{said}\n{made.token}")
-
-
-def free_port(host: str, port: int, *, option: str = "") -> int:
-    """Return the port, or a free one for 0; ``option`` begins the names of the two options.
-
-    Raises
-    ------
-    CommandError
-        The address is taken, or is none of this machine.
-    """
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    try:
-        with socket.socket(family, socket.SOCK_STREAM) as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind((host, port))
-            return int(probe.getsockname()[1])
-    except OSError as error:
-        raise CommandError(
-            f"cannot listen on {host}:{port} ({error.strerror}); choose another "
-            f"--{option}port or --{option}host"
-        ) from None

@@ -17,17 +17,16 @@ from fastapi import APIRouter, Depends, FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.routing import iter_route_contexts
 from starlette.exceptions import HTTPException
+from starlette.middleware.cors import CORSMiddleware
 from starlette.responses import Response
 from starlette.routing import BaseRoute
 
 from api.http.answers import error_answer
 from api.http.audit import note_refusal
 from api.http.context import RequestContext
-from api.http.cors import Cors
 from api.http.deps import refuse_unknown
 from api.http.errors import ApiError, StartError, api_error, wrong_value
 from api.http.openapi import ERRORS, DescribedApi, allowed_methods, describe, operation_id
-from api.http.protocol import Protocol
 from api.http.routes import (
     audit_log,
     challenges,
@@ -45,25 +44,17 @@ from api.http.routes import (
 )
 from api.http.routes.page import page_routes
 from api.http.routes.reference import reference_routes
-from api.limits.admission import Downloads, Gate
+from api.limits.admission import Gate
 from api.limits.rates import RateLimits
 from api.service.allocator import give_back, keep_few_arenas
 from api.service.housekeeping import purge_regularly
-from api.service.logging import configure, log, uvicorn_log_config
-from api.service.metrics import count_lockout, join_shared_directory, set_build
+from api.service.logging import configure, log
+from api.service.metrics import count_lockout, forget_dead_workers, set_build
 from api.service.opening import require_privacy, retention_of
-from api.service.operations import (
-    OPERATIONS_PATHS,
-    Readiness,
-    not_ready_once_told_to_stop,
-    operations_server,
-    tls_options,
-)
+from api.service.readiness import Readiness
 from api.service.runtime import Runtime
-from api.service.supervised import end_with_supervisor, is_supervised, open_patiently, told_to_stop
-from api.settings import NO_PROXIES, Settings
+from api.settings import Settings
 from models.errors import ModelError
-from templates.contract.document import Contract
 from templates.contract.nobody import Nobody
 from templates.distances.blas import single_threaded
 from templates.errors import VeilfaceError
@@ -82,10 +73,25 @@ API = (
     lockout,
     audit_log,
     transfer,
+    health,
 )
-GRACE_S = 20
-SIGN_OF_LIFE_S = 60
-"""Seconds in which a worker must show that it lives; on a busy machine, uvicorn's five are few."""
+CORS_METHODS = ("GET", "PUT", "POST", "DELETE")
+CORS_REQUEST_HEADERS = (
+    "Authorization",
+    "Content-Type",
+    "If-Match",
+    "If-None-Match",
+    "Veilface-Holder-Key",
+    "X-API-Key",
+    "X-Request-ID",
+)
+CORS_ANSWER_HEADERS = (
+    "ETag",
+    "Retry-After",
+    "X-Decoy-Source-ID",
+    "X-Request-ID",
+    "X-Veilface-Notice",
+)
 
 
 def create_app(
@@ -103,14 +109,10 @@ def create_app(
                 # Its sentence is written for the operator and holds no secret.
                 log("start failed: " + str(error), severity=logging.ERROR)
                 raise
-            with not_ready_once_told_to_stop(app.state.readiness):
-                try:
-                    yield
-                finally:
-                    app.state.readiness.stopping = True
+            yield
 
     app = DescribedApi(
-        _document(with_health=settings.operations_port is None),
+        _document(),
         lifespan=lifespan,
         docs_url=None,
         redoc_url=None,
@@ -121,13 +123,9 @@ def create_app(
     app.router.routes.extend(_built(*API))
     if settings.web_page:
         app.router.routes.extend(page_routes(demo=settings.demo, serve_pack=settings.serve_pack))
-    if settings.operations_port is None:
-        app.router.routes.extend(_built(health))
-        _add_middleware(app, settings, operations_paths=OPERATIONS_PATHS)
-    else:
-        _add_middleware(app, settings, operations_paths=frozenset())
     if settings.api_docs:
         app.router.routes.extend(reference_routes())
+    _add_middleware(app, settings)
     return app
 
 
@@ -149,10 +147,9 @@ def _built(*modules: ModuleType) -> tuple[BaseRoute, ...]:
 
 
 @cache
-def _document(*, with_health: bool) -> dict[str, Any]:
+def _document() -> dict[str, Any]:
     """The OpenAPI document, made now and once for a process, for the reason of :func:`_built`."""
-    health_routes = _built(health) if with_health else ()
-    return describe([*_built(*API), *health_routes], version=VERSION)
+    return describe(_built(*API), version=VERSION)
 
 
 def _lift_cohort(nobody: Nobody) -> None:
@@ -163,26 +160,18 @@ def _lift_cohort(nobody: Nobody) -> None:
         log("cohort not lifted", severity=logging.ERROR, error_type=type(error).__name__)
 
 
-def _operations_app(app: FastAPI) -> FastAPI:
-    """Make the application of the operations port: the state of ``app``, and no other routes."""
-    operations_app = FastAPI(
-        openapi_url=None, docs_url=None, redoc_url=None, redirect_slashes=False
-    )
-    operations_app.state = app.state
-    operations_app.router.routes.extend(_built(health))
-    _add_middleware(operations_app, app.state.settings, operations_paths=OPERATIONS_PATHS)
-    return operations_app
-
-
-def _add_middleware(app: FastAPI, settings: Settings, *, operations_paths: frozenset[str]) -> None:
-    app.add_middleware(
-        RequestContext,
-        max_in_flight=settings.max_in_flight,
-        operations_paths=operations_paths,
-        cors=Cors(settings.allowed_origins),
-        demo=settings.demo,
-        tls=settings.tls_certificate is not None,
-    )
+def _add_middleware(app: FastAPI, settings: Settings) -> None:
+    app.add_middleware(RequestContext, demo=settings.demo, tls=settings.tls_certificate is not None)
+    if settings.allowed_origins:
+        # Keys travel in headers and never in a cookie, so credentials are not allowed: a page can
+        # call with a key that it has, and with nothing that the browser keeps for the service.
+        app.add_middleware(
+            CORSMiddleware,
+            allow_origins=sorted(settings.allowed_origins),
+            allow_methods=CORS_METHODS,
+            allow_headers=CORS_REQUEST_HEADERS,
+            expose_headers=CORS_ANSWER_HEADERS,
+        )
     for kind in (ApiError, VeilfaceError, ModelError):
         app.add_exception_handler(kind, _known_error)
     app.add_exception_handler(HTTPException, _framework_error)
@@ -202,19 +191,13 @@ async def _open(
     running.enter_context(single_threaded())
     rate_limits = RateLimits.open(settings)
     running.push_async_callback(rate_limits.close)
-    stop_told = threading.Event()
-    with told_to_stop(stop_told.set):
-        runtime = await anyio.to_thread.run_sync(
-            open_patiently, partial(open_runtime, settings), stop_told
-        )
+    runtime = await anyio.to_thread.run_sync(open_runtime, settings)
     running.push_async_callback(_close, runtime)
     gate = Gate(slots=settings.resolved_compute_slots, waiting=settings.queue_limit)
-    readiness = Readiness(runtime.store, runtime.pack, gate, runtime.keyring)
+    readiness = Readiness(runtime.store, runtime.pack, gate)
     app.state.rate_limits, app.state.runtime = rate_limits, runtime
     app.state.gate, app.state.readiness = gate, readiness
-    app.state.downloads = Downloads(settings.max_in_flight // 4)
-    app.state.scrapes = anyio.CapacityLimiter(1)
-    await anyio.to_thread.run_sync(join_shared_directory)
+    forget_dead_workers()
     set_build(version=VERSION, contract_id=runtime.contract.contract_id)
     log(
         "started",
@@ -249,42 +232,11 @@ async def _open(
     if runtime.contract.takes_lifted_probes:
         # No lifted probe but one that comes now waits for it; an end of the process does not.
         threading.Thread(target=_lift_cohort, args=(runtime.nobody,), daemon=True).start()
-    if is_supervised():
-        tasks.start_soon(end_with_supervisor)
-    if settings.operations_port is not None:
-        app.state.operations_port = await running.enter_async_context(
-            operations_server(
-                _operations_app(app),
-                host=settings.operations_host,
-                port=settings.operations_port,
-            )
-        )
 
 
 async def _close(runtime: Runtime) -> None:
     await anyio.to_thread.run_sync(runtime.close)
     log("stopped", pid=os.getpid())
-
-
-def uvicorn_options(settings: Settings, contract: Contract) -> dict[str, Any]:
-    """Return the keyword arguments of ``uvicorn.Config``."""
-    return {
-        "app": create_app(settings, open_runtime=partial(Runtime.open, contract=contract)),
-        "workers": settings.workers,
-        "host": settings.host,
-        "port": settings.port,
-        "log_config": uvicorn_log_config("warning" if settings.log_level == "info" else "info"),
-        "access_log": False,
-        "http": Protocol,
-        "loop": "uvloop",
-        "server_header": False,
-        "date_header": True,
-        "timeout_graceful_shutdown": GRACE_S,
-        "timeout_worker_healthcheck": SIGN_OF_LIFE_S,
-        "proxy_headers": settings.trusted_proxies != NO_PROXIES,
-        "forwarded_allow_ips": settings.trusted_proxies,
-        **tls_options(settings),
-    }
 
 
 async def _known_error(request: Request, error: Exception) -> Response:

@@ -28,6 +28,8 @@ _header = APIKeyHeader(
 )
 
 T = TypeVar("T")
+BearerDep = Annotated[HTTPAuthorizationCredentials | None, Security(_bearer)]
+HeaderDep = Annotated[str | None, Security(_header)]
 
 
 @dataclass(frozen=True)
@@ -129,8 +131,8 @@ class Call:
 
 async def call_of(
     request: Request,
-    bearer: Annotated[HTTPAuthorizationCredentials | None, Security(_bearer)] = None,
-    header: Annotated[str | None, Security(_header)] = None,
+    bearer: BearerDep = None,
+    header: HeaderDep = None,
 ) -> Call:
     """Recognise the API key of a request, or a token, which counts for the key that made it.
 

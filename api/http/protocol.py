@@ -1,157 +1,69 @@
-"""HTTP/1.1 on a connection: what is refused of a request before the application sees it.
+"""HTTP/1.1 on a connection: uvicorn's protocol on httptools, with a bound on what is not a body.
 
-uvicorn's protocol on h11, with bounds that neither has. Whatever it refuses, it answers in the
-shape of all errors, and closes the connection: where the next request would begin is not known.
+llhttp, the parser, refuses what two servers could read differently: two lengths, a length beside
+chunks, a folded header. But it takes a request line, headers and chunks of any number, and keeps
+the headers. One bound covers them all. A refusal has the shape of all errors.
 """
 
-import asyncio
-import re
 import secrets
-from http import HTTPStatus
 
-import h11
-from uvicorn.protocols.http.h11_impl import H11Protocol
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from api.http.answers import error_answer
-from api.http.context import LINGER_S, SECURITY_HEADERS
 from api.http.errors import ApiError
-from api.service.logging import log
 from api.service.metrics import count_error
 
-MAX_HEAD_BYTES = 16 * 1024
-"""Request line and headers. h11 bounds only what is incomplete; what comes at once, it takes."""
-MAX_HEADERS = 100
+MAX_FRAMING_BYTES = 16 * 1024
+"""Bytes of a request that are not its body: request line, headers, sizes of chunks, trailers."""
 
-CHUNKS = 128
-"""Chunks of a body that may be as small as they like."""
-MEAN_CHUNK_BYTES = 512
-"""Least mean size of the further ones. A chunk takes 5 us of the event loop, however small it is:
-those of one byte a second of it for 1.2 MB."""
-
-_END_OF_HEAD = re.compile(rb"\n\r?\n")
+FRAMING_SHARE = 8
+"""So many bytes of body allow one further byte of framing, which chunks of 64 bytes need."""
 
 
-class BoundedConnection(h11.Connection):
-    """The server's side of a connection; what it refuses, is a violation of the protocol to h11."""
+class Protocol(HttpToolsProtocol):
+    """uvicorn's protocol, which refuses a request whose framing is too large."""
 
-    def __init__(self) -> None:
-        super().__init__(h11.SERVER, MAX_HEAD_BYTES)
-        self.refusal: ApiError | None = None
-        self._chunks = self._bytes = 0
-
-    def next_event(self) -> h11.Event | type[h11.NEED_DATA] | type[h11.PAUSED]:
-        """Return the next event that the client's bytes make.
-
-        Raises
-        ------
-        h11.RemoteProtocolError
-            The request is refused; ``refusal`` says why.
-        """
-        if self.their_state is h11.IDLE:
-            self._check_size()
-        event = super().next_event()
-        if isinstance(event, h11.Request):
-            self._chunks = self._bytes = 0
-            self._check_framing(event)
-        elif isinstance(event, h11.Data):
-            self._chunks += event.chunk_start
-            self._bytes += len(event.data)
-            if (self._chunks - CHUNKS) * MEAN_CHUNK_BYTES > self._bytes:
-                self._refuse(
-                    f"the body comes in chunks of less than {MEAN_CHUNK_BYTES} bytes on average: "
-                    "send it with a Content-Length, or in larger chunks"
-                )
-        return event
-
-    def _check_size(self) -> None:
-        received = self.trailing_data[0]
-        end = _END_OF_HEAD.search(received, 0, MAX_HEAD_BYTES)
-        if end is None and len(received) > MAX_HEAD_BYTES:
-            self._refuse(
-                f"the request line and headers have more than {MAX_HEAD_BYTES} bytes: send fewer "
-                "or shorter headers"
-            )
-        # The request line, and the empty one at the end.
-        if received.count(b"\n", 0, MAX_HEAD_BYTES if end is None else end.end()) > MAX_HEADERS + 2:
-            self._refuse(f"the request has more than {MAX_HEADERS} headers: send fewer")
-
-    def _check_framing(self, request: h11.Request) -> None:
-        names = [name for name, _ in request.headers]
-        if b"transfer-encoding" in names:
-            # What stands before us may go by the other one, and take the rest for a request.
-            if b"content-length" in names:
-                self._refuse("the request has both Content-Length and Transfer-Encoding: send one")
-            if request.http_version < b"1.1":
-                self._refuse("HTTP/1.0 has no Transfer-Encoding: send a Content-Length")
-
-    def _refuse(self, message: str) -> None:
-        self.refusal = ApiError("malformed_request", message)
-        raise h11.RemoteProtocolError(message)
-
-
-class Protocol(H11Protocol):
-    """uvicorn's protocol with a :class:`BoundedConnection`.
-
-    It ends a connection whose client goes on sending a body after the answer: uvicorn would read
-    and drop that for as long as it comes.
-    """
-
-    conn: BoundedConnection
-    _ends = False
-
-    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Begin."""
-        super().connection_made(transport)
-        self.conn = BoundedConnection()
+    _framing_bytes = 0
 
     def data_received(self, data: bytes) -> None:
-        """Take what came in pieces, so that h11 sees in time that trailers are too long."""
-        for start in range(0, len(data), MAX_HEAD_BYTES):
-            if not self._ends:
-                super().data_received(data[start : start + MAX_HEAD_BYTES])
+        """Parse in pieces: a head below the bound passes and one of twice the bound never does."""
+        for start in range(0, len(data), MAX_FRAMING_BYTES):
+            piece = data[start : start + MAX_FRAMING_BYTES]
+            self._framing_bytes += len(piece)
+            super().data_received(piece)
+            if self.transport.is_closing():
+                return
+            if self._framing_bytes > MAX_FRAMING_BYTES:
+                self.send_400_response(
+                    f"headers and chunk sizes have more than {MAX_FRAMING_BYTES} bytes: send fewer "
+                    "or shorter headers, and the body with a Content-Length or in larger chunks"
+                )
+                return
 
-    def send_400_response(self, msg: str) -> None:  # noqa: ARG002 - the base's
-        """Answer what is no request, if no answer has begun, and end the connection."""
-        request_id = secrets.token_hex(16)
-        refusal = self.conn.refusal or ApiError(
-            "malformed_request", "this is not a well-formed HTTP/1.1 request"
-        )
-        if self.cycle is not None and not self.cycle.response_complete:
-            # Nobody takes what the application may still answer.
-            self.cycle.disconnected = True
-            self.cycle.message_event.set()
-        if self.conn.our_state in (h11.IDLE, h11.SEND_RESPONSE):
+    def on_message_begin(self) -> None:
+        """Count anew: this is another request."""
+        super().on_message_begin()
+        self._framing_bytes = 0
+
+    def on_body(self, body: bytes) -> None:
+        """Take a piece of the body, which is no framing."""
+        super().on_body(body)
+        self._framing_bytes -= len(body) + len(body) // FRAMING_SHARE
+
+    def send_400_response(self, msg: str) -> None:
+        """Answer in the shape of all errors, unless an answer has begun; close the connection."""
+        cycle = self.cycle
+        answering = cycle is not None and cycle.response_started and not cycle.response_complete
+        if cycle is not None and not cycle.response_complete:
+            cycle.disconnected = True
+            cycle.message_event.set()
+        if not answering:
+            refusal = ApiError("malformed_request", msg.removesuffix(" received."))
             count_error(refusal.code)
-            log("request refused", request_id=request_id, status=refusal.status, code=refusal.code)
-            self._send(refusal, request_id)
-        self._end()
-
-    def _send(self, refusal: ApiError, request_id: str) -> None:
-        answer = error_answer(refusal, request_id)
-        headers = {**answer.headers, **SECURITY_HEADERS, "X-Request-ID": request_id}
-        events = (
-            h11.Response(
-                status_code=answer.status_code,
-                reason=HTTPStatus(answer.status_code).phrase,
-                headers=[*headers.items(), ("Connection", "close")],
-            ),
-            h11.Data(data=bytes(answer.body)),
-            h11.EndOfMessage(),
-        )
-        for event in events:
-            self.transport.write(self.conn.send(event) or b"")
-
-    def on_response_complete(self) -> None:
-        """Go on with the next request, unless the body of this one still comes."""
-        unread = self.conn.their_state is h11.SEND_BODY
-        super().on_response_complete()
-        if unread and not self.transport.is_closing():
-            self._end()
-
-    def _end(self) -> None:
-        """Close the connection, later: a client that still sends would not see its answer."""
-        self._ends = True
-        self.flow.resume_reading()
-        if self.transport.can_write_eof():
-            self.transport.write_eof()
-        self.loop.call_later(LINGER_S, self.transport.close)
+            request_id = secrets.token_hex(16)
+            answer = error_answer(refusal, request_id)
+            headers = {**answer.headers, "x-request-id": request_id, "connection": "close"}
+            lines = "".join(f"{name}: {value}\r\n" for name, value in headers.items())
+            head = f"HTTP/1.1 400 Bad Request\r\n{lines}\r\n"
+            self.transport.write(head.encode("latin-1") + bytes(answer.body))
+        self.transport.close()

@@ -4,14 +4,10 @@ No label comes from a client: a path is its route's template, a method one of th
 and there is no tenant, no subject and no key among them. So the number of series is bounded.
 
 Several workers share what they count through files in a private folder (prometheus_client's
-multiprocess mode): each of them answers for all. It expects the folder's name before it is
-imported, and workers are forks of a supervisor that has imported it, so each begins anew. A
-folder's files outlive their worker, because a counter must not fall; those of dead workers are
-merged into one.
+multiprocess mode): each of them answers for all. The files outlive their worker, because a counter
+must not fall.
 """
 
-import fcntl
-import logging
 import os
 import tempfile
 from collections.abc import Iterator
@@ -27,18 +23,11 @@ from prometheus_client import (
     ProcessCollector,
     disable_created_metrics,
     generate_latest,
-    values,
 )
-from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
-from prometheus_client.metrics import MetricWrapperBase
-from prometheus_client.metrics_core import Metric
-from prometheus_client.mmap_dict import MmapedDict, mmap_key
 from prometheus_client.multiprocess import MultiProcessCollector, mark_process_dead
-from prometheus_client.registry import Collector
 
 from api.http.errors import ERROR_CODES
 from api.service.environment import variables_set
-from api.service.logging import log
 
 DIRECTORY_VARIABLE = "PROMETHEUS_MULTIPROC_DIR"
 
@@ -46,12 +35,6 @@ UNMATCHED = "unmatched"
 METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
 LIMITS = ("key", "address")
 LOCKOUTS = ("locked", "disabled")
-KINDS = ("counter", "histogram", "gauge_livesum", "gauge_livemin", "gauge_livemax")
-FILE_BYTES = 1024 * 1024
-"""Of one file of counts: more than all series of a kind take, so that it never grows."""
-DEAD = 0
-"""Stands for all dead workers in a file's name; no worker has this process id."""
-
 SECONDS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10, 30)
 
 disable_created_metrics()  # type: ignore[no-untyped-call]
@@ -136,29 +119,16 @@ BUILD = Gauge(
     registry=REGISTRY,
 )
 
-_METRICS = [metric for metric in list(globals().values()) if isinstance(metric, MetricWrapperBase)]
-
-
-def _begin() -> None:
-    """Let all series begin, with values of the kind that prometheus_client makes now."""
-    for metric in _METRICS:
-        if metric._labelnames:
-            metric._metrics.clear()
-        else:
-            metric._metric_init()  # type: ignore[no-untyped-call]
-    # A worker that starts has seen no failure yet; 0 would ring the alarm at each start.
-    STORE_UP.set(1)
-    MODEL_UP.set(1)
-    # So that a rate over the first event is not missing: a series that appears with 1 has no rise.
-    for code in ERROR_CODES:
-        ERRORS.labels(code)
-    for limit in LIMITS:
-        RATE_LIMITED.labels(limit)
-    for kind in LOCKOUTS:
-        LOCKED_OUT.labels(kind)
-
-
-_begin()
+# A worker that starts has seen no failure yet; 0 would ring the alarm at each start.
+STORE_UP.set(1)
+MODEL_UP.set(1)
+# So that a rate over the first event is not missing: a series that appears with 1 has no rise.
+for _code in ERROR_CODES:
+    ERRORS.labels(_code)
+for _limit in LIMITS:
+    RATE_LIMITED.labels(_limit)
+for _kind in LOCKOUTS:
+    LOCKED_OUT.labels(_kind)
 
 
 def step(name: str) -> AbstractContextManager[object]:
@@ -212,154 +182,39 @@ def set_build(*, version: str, contract_id: str) -> None:
 
 def exposition() -> bytes:
     """Write all metrics, of all workers, in Prometheus' text format 0.0.4."""
-    directory = _shared()
-    if directory is None:
+    if DIRECTORY_VARIABLE not in os.environ:
         return generate_latest(REGISTRY)
     registry = CollectorRegistry()
     PlatformCollector(registry=registry)
-    registry.register(_Workers(directory))
-    with _locked(directory):
-        _forget_gauges(directory)
-        MultiProcessCollector(registry, path=str(directory))  # type: ignore[no-untyped-call]
-        return generate_latest(registry)
+    MultiProcessCollector(registry)  # type: ignore[no-untyped-call]
+    return generate_latest(registry)
 
 
 @contextmanager
-def shared_directory() -> Iterator[Path]:
-    """Make the private folder in which workers count together, and remove it at the end."""
+def shared_directory() -> Iterator[None]:
+    """Make the private folder in which workers count together, and remove it at the end.
+
+    prometheus_client looks for its name when it is imported: processes that are started meanwhile
+    find it.
+    """
     with (
         tempfile.TemporaryDirectory(prefix="veilface-metrics-") as folder,
         variables_set({DIRECTORY_VARIABLE: folder}),
     ):
-        yield Path(folder)
-
-
-def _shared() -> Path | None:
-    folder = os.environ.get(DIRECTORY_VARIABLE)
-    return None if folder is None else Path(folder)
-
-
-def join_shared_directory() -> None:
-    """Count in the shared folder, if there is one, from now on; a worker calls this at its start.
-
-    What dead workers left is merged into one file. Otherwise a worker that dies again and again
-    would fill the disk, and slow each scrape.
-    """
-    directory = _shared()
-    if directory is None:
-        return
-    own = [directory / f"{kind}_{os.getpid()}.db" for kind in KINDS]
-    try:
-        with _locked(directory):
-            _forget_gauges(directory)
-            for kind in ("counter", "histogram"):
-                _merge_dead(directory, kind)
-        for path in own:
-            _reserve(path)
-    except OSError as error:
-        for path in own:
-            path.unlink(missing_ok=True)
-        log(
-            "no room in the folder for temporary files: /metrics lacks what this worker counts",
-            severity=logging.ERROR,
-            pid=os.getpid(),
-            error_type=type(error).__name__,
-        )
-        return
-    values.ValueClass = values.get_value_class()  # type: ignore[no-untyped-call]
-    _begin()
-
-
-def _reserve(path: Path) -> None:
-    """Make a file for what is counted, with room on the disk for all of it.
-
-    prometheus_client maps it into memory: a page for which there is no room ends the process.
-    """
-    with path.open("ab") as file:
-        os.posix_fallocate(file.fileno(), 0, FILE_BYTES)
-
-
-def _merge_dead(directory: Path, kind: str) -> None:
-    dead = [path for path in directory.glob(f"{kind}_*.db") if not _alive(_pid(path))]
-    if not any(_pid(path) != DEAD for path in dead):
-        return
-    sums = MultiProcessCollector.merge(  # type: ignore[no-untyped-call]
-        [str(path) for path in dead], accumulate=False
-    )
-    # A glob for *.db does not find it before it is whole.
-    unfinished = directory / f"{kind}.part"
-    unfinished.unlink(missing_ok=True)
-    _reserve(unfinished)
-    merged = MmapedDict(str(unfinished))  # type: ignore[no-untyped-call]
-    for metric in sums:
-        for sample in metric.samples:
-            merged.write_value(  # type: ignore[no-untyped-call]
-                mmap_key(
-                    metric.name,
-                    sample.name,
-                    list(sample.labels),
-                    list(sample.labels.values()),
-                    metric.documentation,
-                ),
-                sample.value,
-                0.0,
-            )
-    merged.close()  # type: ignore[no-untyped-call]
-    # First the sums take the place of what they hold already, then the rest of it goes; a death
-    # between the two counts the rest twice, which is why the order keeps that time short.
-    unfinished.replace(directory / f"{kind}_{DEAD}.db")
-    for path in dead:
-        if _pid(path) != DEAD:
-            path.unlink()
-
-
-def _forget_gauges(directory: Path) -> None:
-    for pid in {_pid(path) for path in directory.glob("gauge_live*.db")}:
-        if not _alive(pid):
-            mark_process_dead(pid, str(directory))  # type: ignore[no-untyped-call]
-
-
-def _pid(path: Path) -> int:
-    return int(path.stem.rsplit("_", 1)[1])
-
-
-def _alive(pid: int) -> bool:
-    if pid == DEAD:
-        return False
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        pass
-    return True
-
-
-@contextmanager
-def _locked(directory: Path) -> Iterator[None]:
-    """Keep a scrape from reading while files are merged, which it would count twice."""
-    with (directory / "lock").open("w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
         yield
 
 
-class _Workers(Collector):
-    """Memory, processor time and open files of each living worker, labelled with its process id."""
-
-    def __init__(self, directory: Path) -> None:
-        self._directory = directory
-
-    def collect(self) -> Iterator[Metric]:
-        families: dict[str, Metric] = {}
-        for pid in sorted({_pid(path) for path in self._directory.glob("gauge_live*.db")}):
-            own = ProcessCollector(pid=lambda pid=pid: pid, registry=None)  # type: ignore[misc]
-            for metric in own.collect():
-                kind = CounterMetricFamily if metric.type == "counter" else GaugeMetricFamily
-                family = families.setdefault(
-                    metric.name, kind(metric.name, metric.documentation, labels=["pid"])
-                )
-                family.add_metric([str(pid)], metric.samples[0].value)  # type: ignore[attr-defined]
-        yield from families.values()
+def forget_dead_workers() -> None:
+    """Drop what workers that died said of the moment; what they counted stays."""
+    folder = os.environ.get(DIRECTORY_VARIABLE)
+    if folder is None:
+        return
+    for path in Path(folder).glob("gauge_live*.db"):
+        pid = int(path.stem.rsplit("_", 1)[1])
+        try:
+            os.kill(pid, 0)
+        except ProcessLookupError:
+            mark_process_dead(pid)  # type: ignore[no-untyped-call]
 
 
 ProcessCollector(registry=REGISTRY)

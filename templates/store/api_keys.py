@@ -50,6 +50,7 @@ class Right(StrEnum):
     EXPORT = "export"
     SCORES = "scores"
     EMBEDDINGS = "embeddings"
+    METRICS = "metrics"
     ADMIN = "admin"
 
 

@@ -23,7 +23,7 @@ from typing import Any
 import httpx
 
 from tests.api.deployment import Deployment, bearer, deploy, images, photo
-from tests.api.service.test_server import Server
+from tests.api.server_process import Server
 from tests.patience import PATIENCE_S
 from tests.ports import free_port
 

@@ -1,15 +1,15 @@
 """Health and metrics: is the process alive, can it answer, and what has it done."""
 
-import anyio
 import anyio.to_thread
-from fastapi import APIRouter, Request
+from fastapi import APIRouter, Depends, Request
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
 from starlette.responses import Response
 
 from api.http.answers import answer
+from api.http.auth import BearerDep, HeaderDep, call_of
 from api.http.schemas import HealthAnswer
 from api.service.metrics import exposition
-from api.service.operations import Readiness
+from api.service.readiness import Readiness
 
 router = APIRouter(tags=["Operations"])
 
@@ -32,17 +32,29 @@ async def live(request: Request) -> Response:
     summary="The worker can answer requests",
 )
 async def ready(request: Request) -> Response:
-    """Right: none. After a failed write the database must take one, a failed model infer once.
-
-    A worker that was told to stop answers `overloaded`.
-    """
+    """Right: none. After a failed write the database must take one, a failed model infer once."""
     readiness: Readiness = request.app.state.readiness
     await readiness.check()
     return answer(request, {"status": "ok"})
 
 
+async def may_read_metrics(
+    request: Request, bearer: BearerDep = None, header: HeaderDep = None
+) -> None:
+    """Demand a key with the right, unless the setting opens the metrics.
+
+    Raises
+    ------
+    ApiError
+        ``unauthorized``, ``forbidden``, ``rate_limited``, ``overloaded``.
+    """
+    if not request.app.state.settings.open_metrics:
+        (await call_of(request, bearer, header)).require("metrics")
+
+
 @router.get(
     "/metrics",
+    dependencies=[Depends(may_read_metrics)],
     response_class=Response,
     responses={
         200: {
@@ -57,8 +69,7 @@ async def ready(request: Request) -> Response:
     },
     summary="What the service has done, for Prometheus",
 )
-async def metrics(request: Request) -> Response:
-    """Right: none. No series names a subject, a tenant or an API key."""
-    limiter: anyio.CapacityLimiter = request.app.state.scrapes
-    text = await anyio.to_thread.run_sync(exposition, limiter=limiter)
+async def metrics() -> Response:
+    """Right: `metrics`. No series names a subject, a tenant or an API key."""
+    text = await anyio.to_thread.run_sync(exposition)
     return Response(text, headers={"Content-Type": CONTENT_TYPE_PLAIN_0_0_4})

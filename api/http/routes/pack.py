@@ -1,6 +1,5 @@
 """The graphs of the pack, for clients that embed: listed, and given by their hashes."""
 
-from contextlib import AbstractContextManager
 from pathlib import Path as FilePath
 from typing import Annotated
 
@@ -15,7 +14,6 @@ from api.http.auth import AnyCall
 from api.http.errors import ApiError
 from api.http.schemas import PackAnswer, PackFileEntry
 from api.http.tokens import SubjectToken
-from api.limits.admission import Downloads
 from api.service.served_graphs import licence_of
 
 router = APIRouter(prefix="/v1/pack", tags=["Tokens"])
@@ -44,23 +42,16 @@ async def token_of(call: AnyCall) -> SubjectToken:
 
 
 class _GraphFile(FileResponse):
-    """The whole of a file, while there is a place for it and its time lasts."""
+    """The whole of a file, while its time lasts."""
 
-    def __init__(
-        self,
-        path: FilePath,
-        *,
-        headers: dict[str, str],
-        place: AbstractContextManager[None],
-        seconds: float,
-    ) -> None:
+    def __init__(self, path: FilePath, *, headers: dict[str, str], seconds: float) -> None:
         headers = {**headers, "Accept-Ranges": "none"}
         super().__init__(path, media_type="application/octet-stream", headers=headers)
-        self._place, self._seconds = place, seconds
+        self._seconds = seconds
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         whole = {**scope, "headers": [pair for pair in scope["headers"] if pair[0] != b"range"]}
-        with self._place, anyio.move_on_after(self._seconds) as time:
+        with anyio.move_on_after(self._seconds) as time:
             await super().__call__(whole, receive, send)
         if time.cancelled_caught:
             raise ClientDisconnect
@@ -101,6 +92,7 @@ async def list_pack(call: AnyCall) -> PackAnswer:
 
 @router.get(
     "/{sha256}",
+    dependencies=[Depends(token_of)],
     response_class=Response,
     responses={
         200: {
@@ -115,14 +107,12 @@ async def list_pack(call: AnyCall) -> PackAnswer:
 )
 async def get_pack_file(
     call: AnyCall,
-    token: Annotated[SubjectToken, Depends(token_of)],
     sha256: Annotated[str, Path(description="Of a file of GET /v1/pack.")],
 ) -> Response:
     """Right: a token, of any action. Only where the deployment serves its pack.
 
     The path names the content, so a copy stays good for ever. Check its SHA-256 before it is run.
-    `Range` is ignored. More files at the same time than there are places for are `overloaded`,
-    and a client that takes one more slowly than 64 KiB a second is cut off.
+    `Range` is ignored. A client that takes a file more slowly than 64 KiB a second is cut off.
     """
     # Looked up among the few that are served: no part of the path reaches the file system.
     graph = call.runtime.graphs.get(sha256)
@@ -132,13 +122,7 @@ async def get_pack_file(
     if has_copy(call.request, headers["ETag"]):
         return Response(status_code=304, headers=headers)
     graph.require_unchanged()
-    downloads: Downloads = call.request.app.state.downloads
-    return _GraphFile(
-        graph.path,
-        headers=headers,
-        place=downloads.place(key=token.key_prefix, token=token.digest),
-        seconds=FIRST_S + graph.size / SLOWEST_BYTES_S,
-    )
+    return _GraphFile(graph.path, headers=headers, seconds=FIRST_S + graph.size / SLOWEST_BYTES_S)
 
 
 def _not_served() -> ApiError:

@@ -125,37 +125,6 @@ def test_a_master_key_beside_the_database_is_used_with_a_warning(world, data):
     assert not warnings(moved)
 
 
-@pytest.mark.parametrize("workers", ["1", pytest.param("2", marks=pytest.mark.long)])
-def test_where_it_listens_is_said_when_connections_are_taken(world, data, tmp_path, workers):
-    process = subprocess.Popen(
-        [sys.executable, "-m", "veilface", "serve", "--port", "0", "--operations-port", "0", *WEAK,
-         "--data-dir", str(data), "--pack", str(world.pack), "--workers", workers],
-        stderr=subprocess.PIPE,
-        stdout=subprocess.DEVNULL,
-        text=True,
-    )  # fmt: skip
-    try:
-        said: dict[str, str] = {}
-        started = 0
-        for line in process.stderr:
-            started += '"event": "started"' in line
-            for what in ("Health and metrics are on ", "listens on "):
-                if what in line:
-                    said[what] = line.split(what)[1].strip()
-            if "listens on " in said:
-                break
-        # At once: a connection that is refused raises.
-        operations, service = said["Health and metrics are on "], said["listens on "]
-        assert httpx.get(f"{operations}/health/ready", timeout=PATIENCE_S).status_code == 200
-        assert httpx.get(f"{service}/v1/contract", timeout=PATIENCE_S).status_code == 401
-        assert started == int(workers)
-        assert "veilface_build_info" in httpx.get(f"{operations}/metrics", timeout=PATIENCE_S).text
-        assert httpx.get(f"{operations}/v1/contract", timeout=PATIENCE_S).status_code == 404
-    finally:
-        process.terminate()
-        process.communicate()
-
-
 def test_what_does_not_fit_stops_the_start_with_a_sentence(world, data, tmp_path):
     absent = run("serve", "--data-dir", tmp_path / "empty")
     assert absent.status == 1
@@ -181,20 +150,6 @@ def test_a_taken_port_is_named(world, data):
         ran = run("serve", "--data-dir", data, "--pack", world.pack, "--port", str(port), *WEAK)
     assert ran.status == 1
     assert f"cannot listen on 127.0.0.1:{port}" in ran.stderr
-
-
-def test_a_taken_operations_port_is_named(world, data):
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        port = taken.getsockname()[1]
-        ran = run(
-            "serve", "--data-dir", data, "--pack", world.pack, "--port", "0",
-            "--operations-port", str(port), *WEAK,
-        )  # fmt: skip
-    assert ran.status == 1
-    assert f"cannot listen on 127.0.0.1:{port}" in ran.stderr
-    assert "--operations-port" in ran.stderr
 
 
 def test_the_check_looks_at_the_key_of_tls_and_the_storage_of_limits(world, data, tmp_path):

@@ -1,7 +1,6 @@
 """The graphs for clients that embed: who gets them, how they are named and kept."""
 
 import hashlib
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +9,9 @@ import pytest
 from starlette.requests import ClientDisconnect
 
 from api.http.app import create_app
-from api.http.errors import ApiError, StartError
+from api.http.errors import StartError
 from api.http.routes.pack import _GraphFile
 from api.http.schemas import PackAnswer
-from api.limits.admission import MOST_OF_TOKEN, Downloads
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, deploy
 from tests.api.shapes import assert_answer, assert_error
@@ -134,53 +132,11 @@ def test_a_service_without_a_pack_has_none_to_serve(deployment: Deployment) -> N
         Client(create_app(settings)).__enter__()
 
 
-def test_slow_downloads_take_few_places(serving: tuple[Client, Deployment]) -> None:
-    client, _ = serving
-    mine, others = with_token(client), with_token(client)
-    path = client.get("/v1/pack", headers=mine).json()["files"][0]["path"]
-    downloads = client.app.state.downloads
-    key, token_id = client.get("/v1/key").json()["prefix"], "another"
-    for _ in range(MOST_OF_TOKEN + 1):  # each gives its place back
-        assert client.get(path, headers=mine).status_code == 200
-    with ExitStack() as held:
-        for number in range(client.app.state.runtime.settings.max_in_flight // 8):
-            held.enter_context(downloads.place(key=key, token=f"{token_id}-{number}"))
-        refused = client.get(path, headers=mine)
-        assert_error(refused, 503, "overloaded")
-        assert int(refused.headers["retry-after"]) >= 1
-        # The list, and a copy that is kept, need no place; no other call does.
-        assert client.get("/v1/pack", headers=mine).status_code == 200
-        kept = client.get(path, headers={**mine, "If-None-Match": "*"})
-        assert kept.status_code == 304
-        assert client.get("/v1/contract", headers=others).status_code == 200
-    assert client.get(path, headers=mine).status_code == 200
-
-
-def test_a_token_a_key_and_all_together_have_their_places() -> None:
-    downloads = Downloads(16)
-    with ExitStack() as held:
-        for _ in range(MOST_OF_TOKEN):
-            held.enter_context(downloads.place(key="a", token="a:1"))
-        with pytest.raises(ApiError, match="try again"), downloads.place(key="a", token="a:1"):
-            pass
-        for number in range(MOST_OF_TOKEN):
-            held.enter_context(downloads.place(key="a", token=f"a:x{number}"))
-        with pytest.raises(ApiError, match="try again"), downloads.place(key="a", token="a:2"):
-            pass
-        for number in range(8):
-            held.enter_context(downloads.place(key="b", token=f"b:{number}"))
-        with pytest.raises(ApiError, match="try again"), downloads.place(key="c", token="c:1"):
-            pass
-    with downloads.place(key="a", token="a:1"):
-        pass
-
-
 def test_a_download_ends_with_its_time(tmp_path: Path) -> None:
     file = tmp_path / "graph.onnx"
     file.write_bytes(bytes(1000))
-    downloads, began = Downloads(2), []
-    place = downloads.place(key="a", token="a:1")
-    response = _GraphFile(file, headers={}, place=place, seconds=0.05)
+    began: list[Any] = []
+    response = _GraphFile(file, headers={}, seconds=0.05)
 
     async def never(message: Any = None) -> Any:
         began.append(message)
@@ -190,5 +146,3 @@ def test_a_download_ends_with_its_time(tmp_path: Path) -> None:
     with pytest.raises(ClientDisconnect):
         anyio.run(response, scope, never, never)
     assert began
-    with downloads.place(key="a", token="a:1"):
-        pass

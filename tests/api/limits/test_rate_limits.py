@@ -19,11 +19,12 @@ import redis
 import uvicorn
 from fastapi import FastAPI
 
-from api.http.app import create_app, uvicorn_options
+from api.http.app import create_app
 from api.http.errors import ApiError, StartError
 from api.limits import rates
 from api.limits.rates import RateLimits, address_of
 from api.service.metrics import RATE_LIMITED, RATE_STORAGE_FAILURES
+from api.service.server import uvicorn_options
 from api.settings import Settings, load_settings
 from tests.api.deployment import Deployment, bearer, deploy
 from tests.api.shapes import assert_error
@@ -291,7 +292,7 @@ def test_an_address_is_refused_before_its_key_is_looked_up(
             assert_error(await sent(app, "/nowhere"), 429, "rate_limited")
             assert (await sent(app, "/nowhere", host="192.0.2.2")).status_code == 404
             # Health is exempt, so that a busy neighbour does not get the service restarted.
-            for path in ("/health/live", "/health/ready", "/metrics"):
+            for path in ("/health/live", "/health/ready"):
                 assert (await sent(app, path)).status_code == 200
 
     anyio.run(scenario)
@@ -367,10 +368,9 @@ def test_forwarded_addresses_are_believed_from_proxies_only(
 
     async def scenario() -> None:
         options = uvicorn_options(settings, tight.contract)
-        config = uvicorn.Config(**{**options, "log_config": None})
+        app = options["app"]()
+        config = uvicorn.Config(**{**options, "app": app, "factory": False, "log_config": None})
         config.load()
-        app = config.app
-        assert isinstance(app, FastAPI)
         async with app.router.lifespan_context(app):
             codes = [
                 (

@@ -1,8 +1,5 @@
 """The service as it is run: uvicorn, two worker processes, real sockets, signals."""
 
-import contextlib
-import json
-import re
 import signal
 import socket
 import subprocess
@@ -15,67 +12,19 @@ from pathlib import Path
 import httpx
 import pytest
 
-from tests.api.deployment import Deployment, bearer, deploy, environment_of, images, photo
+from tests.api.deployment import bearer, deploy, environment_of, images, photo
+from tests.api.server_process import Server
 from tests.api.shapes import assert_error
 from tests.patience import PATIENCE_S, wait_until
 from tests.ports import free_port
-
-RUN = """
-from api.service.opening import open_contract, open_keyring
-from api.service.supervisor import run_server
-from api.settings import load_settings
-
-settings = load_settings()
-run_server(settings, open_contract(settings, open_keyring(settings)))
-"""
-
-
-def in_flight(url: str) -> float:
-    """How many requests the workers of a service are answering."""
-    text = httpx.get(f"{url}/metrics", timeout=PATIENCE_S).text
-    return float(re.findall(r"^veilface_requests_in_flight (.+)$", text, flags=re.M)[0])
-
-
-class Server:
-    def __init__(self, deployment: Deployment, folder: Path, **environment: str) -> None:
-        self.deployment = deployment
-        self.log = folder / "stderr"
-        self.url = f"http://127.0.0.1:{deployment.settings.port}"
-        with self.log.open("wb") as stderr:
-            self.process = subprocess.Popen(
-                [sys.executable, "-c", RUN],
-                cwd=Path(__file__).resolve().parents[3],
-                env={**environment_of(deployment.settings), "OMP_NUM_THREADS": "1", **environment},
-                stderr=stderr,
-            )
-
-    def wait(self) -> None:
-        def ready() -> bool:
-            assert self.process.poll() is None, self.log.read_text()
-            with contextlib.suppress(httpx.TransportError):
-                answer = httpx.get(f"{self.url}/health/ready", timeout=PATIENCE_S)
-                return answer.status_code == 200
-            return False
-
-        wait_until(ready, what="a server that is ready")
-
-    def stop(self) -> int:
-        if self.process.poll() is None:
-            self.process.send_signal(signal.SIGTERM)
-        return self.process.wait(timeout=PATIENCE_S)
 
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     folder = tmp_path_factory.mktemp("server")
-    running = Server(deploy(folder, workers=2, port=free_port(), compute_slots=1), folder)
-    try:
-        running.wait()
+    deployment = deploy(folder, workers=2, port=free_port(), compute_slots=1, open_metrics=True)
+    with Server(deployment, folder) as running:
         yield running
-    finally:
-        if running.process.poll() is None:
-            running.process.kill()
-            running.process.wait()
 
 
 @pytest.fixture(scope="module")
@@ -126,10 +75,7 @@ def test_workers_share_the_database_and_nothing_else(server: Server) -> None:
     assert decisions == ["accept" if person == 1 else "reject" for person in people]
 
     def started() -> set[int]:
-        # A worker may be ready long before the other, and in the middle of a line.
-        whole = [line for line in server.log.read_text().splitlines(True) if line.endswith("\n")]
-        lines = [json.loads(line) for line in whole]
-        return {line["pid"] for line in lines if line["event"] == "started"}
+        return {line["pid"] for line in server.lines() if line["event"] == "started"}
 
     wait_until(lambda: len(started()) == 2, what="both workers")
 
@@ -157,7 +103,7 @@ def test_a_large_body_gets_its_answer(server: Server, http: httpx.Client) -> Non
 
 def test_a_client_that_goes_away_does_no_harm(server: Server, http: httpx.Client) -> None:
     for _ in range(5):
-        with socket.create_connection(("127.0.0.1", server.deployment.settings.port)) as raw:
+        with socket.create_connection(("127.0.0.1", server.port)) as raw:
             raw.sendall(
                 b"PUT /v1/subjects/a/enrollment HTTP/1.1\r\nHost: x\r\n"
                 + f"Authorization: Bearer {server.deployment.token}\r\n".encode()
@@ -168,21 +114,8 @@ def test_a_client_that_goes_away_does_no_harm(server: Server, http: httpx.Client
     assert http.get("/v1/subjects/a").status_code == 200
 
 
-def test_headers_without_end_are_refused(server: Server) -> None:
-    with socket.create_connection(("127.0.0.1", server.deployment.settings.port)) as raw:
-        raw.settimeout(PATIENCE_S)
-        raw.sendall(b"GET /v1/contract HTTP/1.1\r\nHost: x\r\nX-Long: ")
-        seen = b""
-        with contextlib.suppress(BrokenPipeError, ConnectionResetError):
-            for _ in range(64):
-                raw.sendall(b"a" * 4096)
-            seen = raw.recv(65536)
-        assert seen.startswith(b"HTTP/1.1 400") or not seen
-    assert httpx.get(f"{server.url}/health/ready", timeout=PATIENCE_S).status_code == 200
-
-
 def test_a_client_that_asks_first_is_told_at_once(server: Server) -> None:
-    with socket.create_connection(("127.0.0.1", server.deployment.settings.port)) as raw:
+    with socket.create_connection(("127.0.0.1", server.port)) as raw:
         raw.settimeout(PATIENCE_S)
         raw.sendall(
             b"PUT /v1/subjects/a/enrollment HTTP/1.1\r\nHost: x\r\nExpect: 100-continue\r\n"
@@ -199,7 +132,7 @@ def test_stopping_finishes_what_runs_and_logs_only_json(server: Server) -> None:
         + photo(1, 5)
         + b"\r\n--b--\r\n"
     )
-    with socket.create_connection(("127.0.0.1", server.deployment.settings.port)) as raw:
+    with socket.create_connection(("127.0.0.1", server.port)) as raw:
         raw.settimeout(PATIENCE_S)
         raw.sendall(
             b"POST /v1/subjects/a/verify HTTP/1.1\r\nHost: x\r\n"
@@ -208,16 +141,26 @@ def test_stopping_finishes_what_runs_and_logs_only_json(server: Server) -> None:
             + f"Content-Length: {len(body)}\r\n\r\n".encode()
             + body[:1000]
         )
-        wait_until(lambda: in_flight(server.url) == 1, what="a worker that reads")
+        wait_until(lambda: server.in_flight() == 2, what="a worker that reads")  # and the scrape
         server.process.send_signal(signal.SIGTERM)
-        time.sleep(1)
+
+        def refused() -> bool:
+            try:
+                socket.create_connection(("127.0.0.1", server.port)).close()
+            except ConnectionRefusedError:
+                return True
+            return False
+
+        # What watches the service sees at once that it is not ready any more.
+        wait_until(refused, what="a port that nobody listens on")
         raw.sendall(body[1000:])
         seen = b""
         while piece := raw.recv(65536):
             seen += piece
         assert b'"decision":"accept"' in seen
     assert server.stop() == 0
-    lines = [json.loads(line) for line in server.log.read_text().splitlines()]
+    lines = server.lines()
+    assert "Traceback" not in server.log.read_text()
     assert sum(line["event"] == "stopped" for line in lines) == 2
     events = {line["event"] for line in lines}
     assert not any("HTTP/1.1" in event for event in events)

@@ -1,9 +1,7 @@
 """A start that cannot work ends in one sentence; one that works needs little."""
 
-import gc
 import stat
-import weakref
-from collections.abc import Callable, MutableMapping
+from collections.abc import MutableMapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -28,7 +26,7 @@ from api.service.opening import (
 from api.service.runtime import Runtime
 from api.settings import Settings
 from models.pack import ModelPack
-from templates.contract.document import Contract, Rate
+from templates.contract.document import Rate
 from templates.contract.nobody import Nobody
 from templates.contract.verdict import Verdict
 from templates.decoys import DecoyGenerator
@@ -310,55 +308,6 @@ def test_the_server_is_not_handed_the_text_of_a_failed_start(
     logged = capfd.readouterr().err
     assert "hunter2" not in logged
     assert type(error).__name__ in logged
-
-
-def test_serving_keeps_no_second_copy_of_the_models(
-    fresh: Deployment, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The command opens everything to check it; the workers open it anew."""
-    opened: list[weakref.ref[Runtime]] = []
-    alive: list[bool] = []
-    really_open = Runtime.open
-
-    def remembered(settings: Settings) -> Runtime:
-        runtime = really_open(settings)
-        opened.append(weakref.ref(runtime))
-        return runtime
-
-    def serving(_: Settings, _contract: Contract, *, on_ready: Callable[[], None]) -> None:
-        gc.collect()
-        alive.extend(each() is not None for each in opened)
-
-    monkeypatch.setattr(Runtime, "open", remembered)
-    monkeypatch.setattr("api.cli.serve.run_server", serving)
-    folders = ("--data-dir", fresh.settings.data_dir, "--pack", str(fresh.settings.pack))
-    ran = run("serve", "--port", "0", *folders)
-    assert ran.status == 0, ran.stderr
-    assert alive == [False]
-
-
-def test_accelerators_are_not_started_before_the_fork(
-    fresh: Deployment, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    providers: list[tuple[str, ...]] = []
-    really_open = Runtime.open
-
-    def noted(settings: Settings) -> Runtime:
-        providers.append(settings.providers)
-        return really_open(settings)
-
-    monkeypatch.setattr(Runtime, "open", noted)
-    monkeypatch.setattr("api.cli.serve.run_server", lambda *_given, **_named: None)
-    folders = ("--data-dir", fresh.settings.data_dir, "--pack", str(fresh.settings.pack))
-    named = "CPUExecutionProvider"
-    for more in (["--workers", "2"], [], ["--workers", "2", "--check"]):
-        ran = run("serve", "--port", "0", *folders, "--providers", named, *more)
-        assert ran.status == 0, ran.stderr
-    assert providers == [("cpu",), (named,), (named,)]
-    ran = run("serve", "--port", "0", *folders, "--providers", "cuda", "--workers", "2")
-    assert ran.status == 1
-    assert "'cuda' was requested and is not available" in ran.stderr
-    assert len(providers) == 3
 
 
 def test_recalibration_keeps_the_templates(fresh: Deployment) -> None:

@@ -1,0 +1,105 @@
+"""Whether this worker can answer, by what it asks and by what requests ran into."""
+
+import logging
+
+import anyio
+
+from api.http.errors import ApiError, StartError, api_error
+from api.limits.admission import Gate
+from api.service.logging import log
+from api.service.metrics import MODEL_UP, STORE_UP
+from api.service.opening import try_inference
+from models.errors import ModelError
+from models.pack import ModelPack
+from templates.errors import StoreBusy, StoreError
+from templates.store import TemplateStore
+from templates.store.tenants import RetiredRotation
+
+WATCH_S = 5.0
+UP = {"store": STORE_UP, "model": MODEL_UP}
+
+
+class Readiness:
+    """What is known to fail.
+
+    A database may answer and yet take no write, and a model may be there and yet fail. So after a
+    failure the thing that failed must succeed once before the worker is ready again.
+
+    Parameters
+    ----------
+    store, pack, gate
+        What is asked, and what bounds the asking; no pack is nothing to ask.
+    """
+
+    def __init__(self, store: TemplateStore, pack: ModelPack | None, gate: Gate) -> None:
+        self._store = store
+        self._pack = pack
+        self._gate = gate
+        self._failed: set[str] = set()
+        for gauge in UP.values():
+            gauge.set(1)
+
+    def note(self, error: Exception) -> None:
+        """Take note of an error that some work ended with, if it says that store or model fail."""
+        known = api_error(error)
+        if isinstance(error, ApiError) or known is None:
+            return
+        passing = isinstance(error, StoreBusy | RetiredRotation)
+        if known.code == "store_unavailable" and isinstance(error, StoreError) and not passing:
+            self._fail("store", error)
+        elif known.code == "model_unavailable":
+            self._fail("model", error)
+
+    async def check(self) -> None:
+        """Ask the database, and try again what failed last.
+
+        Raises
+        ------
+        ApiError, StoreError, ModelError
+            ``overloaded``, ``store_unavailable``, ``model_unavailable``.
+        """
+        try:
+            await self._gate.query(self._store.ping)
+            if "store" in self._failed:
+                await self._gate.query(self._store.ping_write)
+                self._recovered("store")
+            if "model" in self._failed:
+                await self._gate.compute(self._infer, key="")
+                self._recovered("model")
+        except Exception as error:
+            self.note(error)
+            raise
+
+    async def watch(self, *, every_s: float = WATCH_S) -> None:
+        """Check now and then, so that metrics are right where nobody asks, until cancelled."""
+        while True:
+            await anyio.sleep(every_s)
+            try:
+                await self.check()
+            except Exception as error:
+                # Noted already. The next look must come: this task ends with the worker only.
+                log("check failed", severity=logging.DEBUG, error_type=type(error).__name__)
+
+    def _infer(self) -> None:
+        assert self._pack is not None  # noqa: S101 - no inference fails without a pack
+        try:
+            try_inference(self._pack)
+        except StartError as error:
+            raise ModelError(str(error)) from error
+
+    def _fail(self, what: str, error: Exception) -> None:
+        if what not in self._failed:
+            log(
+                f"{what} failed",
+                severity=logging.ERROR,
+                code=f"{what}_unavailable",
+                error_type=type(error).__name__,
+            )
+        self._failed.add(what)
+        UP[what].set(0)
+
+    def _recovered(self, what: str) -> None:
+        if what in self._failed:
+            log(f"{what} is available again")
+        self._failed.discard(what)
+        UP[what].set(1)
