@@ -33,7 +33,7 @@ def refused(*given: Any, **named: Any) -> Any:
 def test_a_cluster_gives_the_same_bits(bench, results, cluster, tmp_path, monkeypatch):
     before = {process.pid for process in psutil.Process().children(recursive=True)}
     # Workers are processes of their own: this one compares nothing.
-    monkeypatch.setattr(experiment, "run_unit", refused)
+    monkeypatch.setattr(experiment, "compare", refused)
     out = tmp_path / "out"
     ran = run(*bench.full, "--cluster", cluster.scheduler_address, "--out", out, "--json")
     assert ran.status == 0, ran.stderr
