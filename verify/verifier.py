@@ -1,15 +1,12 @@
 """A probe against a stored template becomes a decision."""
 
 import secrets
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from models.decoding import DEFAULT_LIMITS, ImageLimits
-from models.pack import ModelPack
-from models.selection import FacePolicy
 from templates.contract import wire
 from templates.contract.document import Calibration, Contract, Level
 from templates.decoys import DecoySource
@@ -21,7 +18,6 @@ from templates.space.embedding import unit_rows
 from templates.space.subspace import SubspaceBatch, Turn
 from verify.cohort import Probes, expected_similarity
 from verify.decision import Decision, StandIn
-from verify.photo_probe import MAX_PROBE_PHOTOS, PhotoProbe, probe_of_photos
 
 _NO_SALT = "0" * 32
 
@@ -79,41 +75,6 @@ class Verifier:
         self._nobody = contract.nobody(source)
         self._rotation = rotation
         self._nobodys_key = secrets.token_bytes(KEY_BYTES)
-
-    def photo_probe(
-        self,
-        pack: ModelPack,
-        photos: Sequence[bytes],
-        *,
-        passive: bool = False,
-        policy: FacePolicy = FacePolicy.DOMINANT,
-        limits: ImageLimits = DEFAULT_LIMITS,
-    ) -> PhotoProbe:
-        """Make one probe of 1 to 5 photo files; with `passive`, say whether they look live.
-
-        Raises
-        ------
-        ContractMismatch
-            Where the pack is not the contract's.
-        PhotoRejected
-            Where one photo has no usable face.
-        InconsistentImages
-            Where the photos do not show one person.
-        Uncalibrated
-            With `passive`, where the contract has no liveness threshold.
-        """
-        self._require(pack)
-        if not 1 <= len(photos) <= MAX_PROBE_PHOTOS:
-            raise ValueError(f"a probe has 1 to {MAX_PROBE_PHOTOS} photos, not {len(photos)}")
-        return probe_of_photos(
-            pack, self._contract, photos, passive=passive, policy=policy, limits=limits
-        )
-
-    def _require(self, pack: ModelPack) -> None:
-        info = pack.info
-        self._contract.binding.require_embedder(
-            embedder_sha256=info.embedder_sha256, preprocessing=info.preprocessing, n=info.n
-        )
 
     def decide_embedding(
         self,

@@ -31,7 +31,7 @@ from templates.space.agreement import InconsistentImages
 from templates.store.audit_log import Entry
 from templates.store.subject_rows import Source
 from templates.store.subjects import Precondition
-from verify import MAX_PROBE_PHOTOS
+from verify import MAX_PROBE_PHOTOS, probe_of_photos
 
 Subject = Annotated[str, typer.Argument(help="Id of the person.")]
 Face = Annotated[
@@ -195,7 +195,10 @@ def verify(
         except ApiError as error:
             raise UsageError(error.message) from None
         with _named(photos):
-            probe = verifier.photo_probe(pack, data, policy=face, limits=runtime.image_limits)
+            probe = probe_of_photos(
+                pack, runtime.contract, data,
+                passive=False, policy=face, limits=runtime.image_limits,
+            )  # fmt: skip
         decision = verifier.decide_embedding(
             probe.embedding, template, holder_key=holder_key, level=level, photos=probe.photos
         ).with_advice(clear=probe.clear)
