@@ -39,97 +39,103 @@ export const check = (blob, face, signal) =>
 export const unasked = ({ status, code }) =>
   code !== "page_error" && (!status || status === 429 || status >= 500);
 
-// The visitor's camera. `lost` is called where it is unplugged, forbidden, or taken by another program.
-export async function openCamera(signal, lost) {
-  let stream;
-  try {
-    if (!navigator.mediaDevices) throw new Error("insecure");
-    stream = await navigator.mediaDevices.getUserMedia({
-      audio: false,
-      video: { facingMode: "user", width: { ideal: PHOTO } },
-    });
-  } catch (error) {
-    throw new Problem({ code: "camera", message: cameraTrouble(error) });
-  }
-  for (const track of stream.getVideoTracks()) {
-    for (const name of ["ended", "mute"]) track.addEventListener(name, lost, { signal });
-  }
-  return stream;
-}
-
 export const after = (ms) => new Promise((done) => setTimeout(done, ms));
 
-export const release = (stream) => stream?.getTracks().forEach((each) => each.stop());
+const release = (stream) => stream?.getTracks().forEach((each) => each.stop());
+
+// The picture of the visitor's camera, mirrored, with what lies over it.
+export function viewfinder(overlay) {
+  const video = h("video", { playsinline: true, muted: true, "aria-label": "Your camera" });
+  video.muted = true;
+  const root = h("div", { class: "viewfinder", hidden: true }, video, overlay);
+  return {
+    root,
+    // Runs until `signal` ends. `lost` is called where it is unplugged, forbidden, or taken by another program.
+    async open(signal, lost) {
+      let stream = null;
+      signal.addEventListener("abort", () => {
+        release(stream);
+        video.srcObject = null;
+        root.hidden = true;
+      });
+      try {
+        if (!navigator.mediaDevices) throw new Error("insecure");
+        stream = await navigator.mediaDevices.getUserMedia({
+          audio: false,
+          video: { facingMode: "user", width: { ideal: PHOTO } },
+        });
+      } catch (error) {
+        throw new Problem({ code: "camera", message: cameraTrouble(error) });
+      }
+      // The view may have been left while the browser asked.
+      if (signal.aborted) release(stream);
+      signal.throwIfAborted();
+      for (const track of stream.getVideoTracks()) {
+        for (const name of ["ended", "mute"]) track.addEventListener(name, lost, { signal });
+      }
+      addEventListener("pagehide", lost, { signal });
+      video.srcObject = stream;
+      await video.play().catch(() => {});
+      signal.throwIfAborted();
+      root.hidden = false;
+    },
+    isOn: () => video.videoWidth > 0,
+    shot: (options) => picture(video, video.videoWidth, video.videoHeight, options),
+  };
+}
 
 // `onburst(photos)` gets the photos of a burst that would do, as {blob, name, seen}: `seen`
 // is what the service saw, or null where it could not be asked; `face()` says which face counts.
 export function camera({ onburst, face }) {
-  const video = h("video", { playsinline: true, muted: true, "aria-label": "Your camera" });
-  video.muted = true;
   const { overlay, mark } = faceBox();
-  const viewfinder = h("div", { class: "viewfinder", hidden: true }, video, overlay);
+  const finder = viewfinder(overlay);
   const said = h("p", { class: "guidance", role: "status", "data-state": "idle" }, OFF);
   const start = h("button", { type: "button", class: "secondary", onclick: begin }, "Start camera");
   const take = h("button", { type: "button", hidden: true, onclick: burst }, TAKE);
   const refused = h("p", { class: "refused", role: "status" });
-  let stream = null;
   let running = new AbortController();
 
   function say(text, state) {
     // Only what changed is read out.
     if (said.textContent !== text) said.textContent = text;
     said.dataset.state = state;
-    viewfinder.dataset.state = state;
   }
 
   async function begin() {
-    stop();
+    running.abort();
     running = new AbortController();
     const { signal } = running;
     start.disabled = true;
     refused.textContent = "";
-    let opened = null;
     try {
-      opened = await openCamera(signal, lost);
+      await finder.open(signal, lost);
     } catch (error) {
       start.disabled = false;
       if (!signal.aborted) say(`${sentence(error.message)} You can also choose files.`, "bad");
       return;
     }
-    if (over(signal)) return release(opened);
-    stream = opened;
-    addEventListener("pagehide", lost, { signal });
-    video.srcObject = stream;
-    await video.play().catch(() => {});
-    if (over(signal)) return release(opened);
-    viewfinder.hidden = take.hidden = false;
+    take.hidden = false;
     start.hidden = true;
     take.focus();
     say("Looking for a face…", "idle");
     guide(signal);
   }
 
-  // The view was left, or the camera stopped, while something was awaited.
-  function over(signal) {
-    if (!signal.aborted && !root.isConnected) stop();
-    return signal.aborted;
-  }
-
   async function guide(signal) {
-    while (!over(signal)) {
+    while (!signal.aborted) {
       const begun = Date.now();
       let pause = EVERY_MS;
       // Photos go first.
-      if (!document.hidden && video.videoWidth && !take.matches(":disabled")) {
+      if (!document.hidden && finder.isOn() && !take.matches(":disabled")) {
         try {
           const small = await snap(FRAME, 0.8);
-          if (over(signal)) return;
+          if (signal.aborted) return;
           const seen = await check(small.blob, face(), signal);
-          if (over(signal)) return;
+          if (signal.aborted) return;
           say(guidance(seen), seen.usable ? "good" : "bad");
           mark(seen.box, small.width, small.height);
         } catch (error) {
-          if (over(signal)) return;
+          if (signal.aborted) return;
           mark(null);
           const known = error instanceof Problem;
           pause = 1000 * Math.max(2, (known && error.wait) || 0);
@@ -146,8 +152,7 @@ export function camera({ onburst, face }) {
   }
 
   // Packs without a detector take aligned crops, which are square.
-  const snap = (side, quality) =>
-    picture(video, video.videoWidth, video.videoHeight, { side, quality, square: crops() });
+  const snap = (side, quality) => finder.shot({ side, quality, square: crops() });
 
   // Why a photo would not do, or null.
   async function judge(photo, signal) {
@@ -171,7 +176,7 @@ export function camera({ onburst, face }) {
     try {
       for (let shot = 0; shot < BURST; shot++) {
         if (shot) await after(APART_MS);
-        if (over(signal)) return;
+        if (signal.aborted) return;
         const photo = { blob: (await snap(PHOTO, QUALITY)).blob, name: "camera", seen: null };
         judged = judged.then(async () => {
           const not = await judge(photo, signal);
@@ -182,14 +187,14 @@ export function camera({ onburst, face }) {
       }
       await judged;
     } catch (error) {
-      if (over(signal)) return;
+      if (signal.aborted) return;
       if (!(error instanceof Problem)) throw error;
       why = sentence(error.message);
     } finally {
       take.disabled = false;
       take.textContent = TAKE;
     }
-    if (over(signal)) return;
+    if (signal.aborted) return;
     // Unless the visitor went on meanwhile; a button that is switched off loses the focus.
     if (document.activeElement === document.body) take.focus();
     if (why) refused.textContent = `${good.length || "None"} of ${BURST} photos taken. ${why}`;
@@ -198,19 +203,13 @@ export function camera({ onburst, face }) {
 
   function lost() {
     const focused = document.activeElement === take;
-    stop();
-    viewfinder.hidden = take.hidden = true;
+    running.abort();
+    take.hidden = true;
     start.hidden = start.disabled = false;
     if (focused) start.focus();
     say("The camera has stopped. Start it again, or choose files.", "bad");
   }
 
-  function stop() {
-    running.abort();
-    release(stream);
-    video.srcObject = stream = null;
-  }
-
-  const root = h("div", { class: "camera" }, viewfinder, said, h("div", { class: "row" }, start, take), refused);
-  return { root, stop };
+  const root = h("div", { class: "camera" }, finder.root, said, h("div", { class: "row" }, start, take), refused);
+  return { root, stop: () => running.abort() };
 }

@@ -1,7 +1,7 @@
 // A challenge of head movements: the page says each by the clock, and takes frames meanwhile. It does
 // not wait until it sees one: a recording that shows all movements in turn would be waited for, too.
 
-import { after, openCamera, picture, release } from "./camera.js";
+import { after, viewfinder } from "./camera.js";
 import { h, s } from "./dom.js";
 import { Problem, call } from "./service.js";
 import { FRONT, MOVE_BACK, MOVEMENTS } from "./words.js";
@@ -14,19 +14,16 @@ const BACK_MS = 1300;
 
 // `frames(subject)` resolves to {challenge_id, photos}.
 export function headMovements() {
-  const video = h("video", { playsinline: true, muted: true, "aria-label": "Your camera" });
-  video.muted = true;
   const outline = s("ellipse", { class: "outline", cx: "50", cy: "50", rx: "21", ry: "40" });
   const overlay = s(
     "svg",
     { class: "overlay", viewBox: "0 0 100 100", preserveAspectRatio: "none", "aria-hidden": "true" },
     outline,
   );
-  const viewfinder = h("div", { class: "viewfinder", hidden: true }, video, overlay);
+  const finder = viewfinder(overlay);
   const arrow = h("span", { class: "arrow", "aria-hidden": "true" });
   const words = h("span", {});
   const told = h("p", { class: "movement", role: "status", "aria-live": "assertive", hidden: true }, arrow, words);
-  let stream = null;
   let running = new AbortController();
 
   function say(name) {
@@ -36,20 +33,14 @@ export function headMovements() {
   }
 
   async function frames(subject) {
-    stop();
+    running.abort();
     running = new AbortController();
     const run = running;
     const { signal } = run;
     try {
-      const opened = await openCamera(signal, () => lost(run));
-      if (signal.aborted) release(opened);
-      signal.throwIfAborted();
-      stream = opened;
-      video.srcObject = stream;
-      await video.play().catch(() => {});
-      viewfinder.hidden = false;
+      await finder.open(signal, () => run.abort(new Problem({ code: "camera", message: "the camera has stopped" })));
       say(FRONT);
-      viewfinder.scrollIntoView({ block: "nearest" });
+      finder.root.scrollIntoView({ block: "nearest" });
       await after(READY_MS);
       signal.throwIfAborted();
       // Asked for now: its minute has begun.
@@ -69,23 +60,15 @@ export function headMovements() {
     } catch (error) {
       throw signal.reason instanceof Problem ? signal.reason : error;
     } finally {
-      if (running.signal === signal) stop();
+      run.abort();
+      if (running === run) told.hidden = true;
     }
   }
 
   async function snap(signal, wait = 0) {
     await after(wait);
     signal.throwIfAborted();
-    return (await picture(video, video.videoWidth, video.videoHeight, { side: SIDE })).blob;
-  }
-
-  const lost = (run) => run.abort(new Problem({ code: "camera", message: "the camera has stopped" }));
-
-  function stop() {
-    running.abort();
-    release(stream);
-    video.srcObject = stream = null;
-    viewfinder.hidden = told.hidden = true;
+    return (await finder.shot({ side: SIDE })).blob;
   }
 
   const root = h(
@@ -97,7 +80,8 @@ export function headMovements() {
       "The page will ask for three head movements and take frames of them, for about twelve seconds. Keep your face inside the outline.",
     ),
     told,
-    viewfinder,
+    finder.root,
+    h("p", { class: "hint" }, "If you cannot turn your head, ask the operator for another way."),
   );
-  return { root, frames, stop };
+  return { root, frames, stop: () => running.abort() };
 }

@@ -54,20 +54,6 @@ export function faceBox() {
   return { overlay, mark };
 }
 
-// A form, and beside it what comes of it: before that, what is to be done.
-export const workbench = (form, title, steps, ...outcome) =>
-  h(
-    "div",
-    { class: "work" },
-    form,
-    h(
-      "div",
-      { class: "outcome" },
-      outcome,
-      h("section", { class: "card empty" }, h("h2", {}, title), h("ol", {}, steps.map((each) => h("li", {}, each)))),
-    ),
-  );
-
 // Terms and values; a value that is null is left out.
 export function facts(pairs) {
   return h(
@@ -97,20 +83,32 @@ export function table(caption, head, rows) {
   );
 }
 
-// A modal dialog with the focus in its first control; it goes when it is closed.
-export function openDialog(title, text, ...rest) {
+// Ask in a modal dialog, with the focus on the answer that does nothing; resolves to whether the visitor agreed.
+// It closes unanswered when `signal` ends.
+export function confirmed(title, text, verb, signal) {
   const id = newId("dialog");
+  const answer = (value) => () => dialog.close(value);
   const dialog = h(
     "dialog",
     { "aria-labelledby": `${id}-title`, "aria-describedby": `${id}-text` },
     h("h2", { id: `${id}-title` }, title),
     h("p", { id: `${id}-text` }, text),
-    ...rest,
+    h(
+      "p",
+      { class: "row" },
+      h("button", { type: "button", class: "secondary", onclick: answer("keep") }, "Keep"),
+      h("button", { type: "button", class: "danger", onclick: answer("agreed") }, verb),
+    ),
   );
-  dialog.addEventListener("close", () => dialog.remove());
+  signal.addEventListener("abort", answer("ended"));
   document.body.append(dialog);
   dialog.showModal();
-  return dialog;
+  return new Promise((resolve) => {
+    dialog.addEventListener("close", () => {
+      dialog.remove();
+      resolve(dialog.returnValue === "agreed");
+    });
+  });
 }
 
 export const percent = (rate) =>

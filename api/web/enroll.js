@@ -1,9 +1,7 @@
-import { facts, h, openDialog, workbench } from "./dom.js";
-import { holderKey } from "./holder.js";
-import { photoPicker } from "./photos.js";
+import { confirmed, facts, h } from "./dom.js";
+import { photoForm } from "./form.js";
 import { call, form, session, subjectPath } from "./service.js";
-import { SPELLING, offNote, subjectField, switchOf, whyOff } from "./subject.js";
-import { problemBox } from "./words.js";
+import { SPELLING } from "./subject.js";
 
 const STEPS = [
   "The service finds the face in each photo and says at once whether the photo will do.",
@@ -12,163 +10,70 @@ const STEPS = [
 ];
 
 export function enrollView(id) {
-  const why = whyOff("enroll");
-  const [subject, subjectPart] = subjectField(id, `A new id (${SPELLING}), or whom to enroll again.`);
-  const result = h("div", { class: "result" });
-  let dialog = null;
-  const holder = holderKey("enroll", subject, () => result.replaceChildren());
-  const send = h("button", { type: "submit", disabled: true }, "Enroll");
-  const say = (text) => (send.textContent = text);
-  const picker = why
-    ? null
-    : photoPicker({
-        most: 10,
-        onchange: (ready) => {
-          send.disabled = !ready;
-          result.replaceChildren();
-        },
-      });
-
-  const mode = why === null ? session.mode?.offer("enroll", showSteps) : null;
-  function showSteps() {
-    mode?.at();
-    const words = session.mode?.active() ? session.mode.STEPS : STEPS;
-    steps.forEach((step, index) => (step.textContent = words[index]));
-  }
+  const ended = new AbortController();
 
   // The service says whom it would replace, and replaces nobody else: so nothing is replaced unasked.
-  async function put(name, send) {
+  async function send(name, given, { lifts, say }) {
+    say("Enrolling…");
+    const { photos, ...fields } = given;
+    // `replaces` is the template that may be replaced, or null.
+    const put = (replaces) =>
+      lifts
+        ? lifts.enroll(name, given, replaces)
+        : call("PUT", `${subjectPath(name)}/enrollment`, {
+            body: form("images", photos, fields),
+            headers: replaces ? { "If-Match": `"${replaces}"` } : { "If-None-Match": "*" },
+          });
     try {
-      return await send(null);
+      return await put(null);
     } catch (error) {
       const known = error.code === "enrollment_conflict" && error.details.template_id;
       if (!known) throw error;
-      return (await mayReplace(name)) ? await send(known) : null;
-    }
-  }
-
-  // `replaces` is the template that may be replaced, or null.
-  const sender = (name, photos, given) => (replaces) =>
-    call("PUT", `${subjectPath(name)}/enrollment`, {
-      body: form("images", photos, given),
-      headers: replaces ? { "If-Match": `"${replaces}"` } : { "If-None-Match": "*" },
-    });
-
-  function mayReplace(name) {
-    const close = (value) => () => dialog.close(value);
-    dialog = openDialog(
-      `Replace ${name}’s enrollment?`,
-      "This person is enrolled already. Enrolling again replaces their template and its lock.",
-      h(
-        "p",
-        { class: "row" },
-        h("button", { type: "button", class: "secondary", onclick: close("keep") }, "Keep"),
-        h("button", { type: "button", class: "danger", onclick: close("replace") }, "Replace"),
-      ),
-    );
-    const opened = dialog;
-    return new Promise((resolve) => {
-      opened.addEventListener("close", () => resolve(opened.returnValue === "replace"));
-    });
-  }
-
-  async function submit(event) {
-    event.preventDefault();
-    if (fields.disabled) return;
-    // The answer is about this person and these photos, whatever else is chosen when it comes.
-    const name = subject.value;
-    const sent = picker.chosen();
-    const [photos, face, lifts] = [picker.blobs(), picker.face(), session.mode?.active()];
-    fields.disabled = true;
-    result.replaceChildren();
-    try {
-      const holder_key = await holder.key(name, say);
-      say("Enrolling…");
-      const answer = await put(
-        name,
-        lifts
-          ? (replaces) => session.mode.enroll(name, { photos, face, holder_key }, replaces)
-          : sender(name, photos, { face, holder_key }),
+      const agreed = await confirmed(
+        `Replace ${name}’s enrollment?`,
+        "This person is enrolled already. Enrolling again replaces their template and its lock.",
+        "Replace",
+        ended.signal,
       );
-      fields.disabled = false;
-      if (answer) {
-        const shown = enrolled(name, answer, picker.drop(sent));
-        // The field says who is enrolled.
-        subject.dispatchEvent(new Event("input"));
-        result.replaceChildren(shown);
-        if (lifts && root.isConnected) result.append(session.mode.whatLeft());
-        shown.focus();
-      }
-    } catch (error) {
-      fields.disabled = false;
-      if (error.details) picker.blame(error, sent);
-      result.replaceChildren(problemBox(error));
-      if (lifts && root.isConnected) result.append(session.mode.whatLeft());
-      result.scrollIntoView({ block: "nearest" });
+      return agreed ? await put(known) : null;
     }
-    say("Enroll");
-    send.disabled = !picker.ready();
-    if (document.activeElement === document.body) send.focus();
   }
 
-  const fields = h(
-    "fieldset",
-    { class: "plain", disabled: why !== null },
-    subjectPart,
-    switchOf(mode),
-    picker?.root ?? null,
-    holder.parts,
-    send,
-  );
-
-  const entry = h("form", { class: "card", onsubmit: submit }, fields);
-  const steps = STEPS.map(() => h("span", {}));
-  showSteps();
-  const root = h(
-    "section",
-    {},
-    h("h1", { tabindex: "-1" }, "Enroll"),
-    h(
-      "p",
-      { class: "lead" },
-      "One to ten photos of a person become one private template. ",
+  return photoForm(id, {
+    action: "enroll",
+    title: "Enroll",
+    lead:
+      "One to ten photos of a person become one private template. " +
       "Whoever is enrolled already is replaced only if you confirm it.",
-    ),
-    offNote(why),
-    workbench(entry, "What happens to the photos", steps, result),
-  );
-  picker?.dropOn(entry);
-  return {
-    root,
-    stop() {
-      dialog?.close();
-      holder.stop();
-      picker?.stop();
-    },
-  };
+    idHint: `A new id (${SPELLING}), or whom to enroll again.`,
+    heading: "What happens to the photos",
+    steps: () => (session.mode?.active() ? session.mode.STEPS : STEPS),
+    most: 10,
+    always: true,
+    verb: () => "Enroll",
+    send,
+    show: enrolled,
+    remedies: () => [],
+    stop: () => ended.abort(),
+  });
 }
 
-function enrolled(id, answer, thumbs) {
+function enrolled(id, answer, { drop }) {
+  const photos = drop().map((each, index) =>
+    h("li", {}, each, ` Photo ${index + 1}: ${answer.images[index]?.status ?? "used"}`),
+  );
   return h(
     "div",
-    { class: "verdict accept", role: "status", tabindex: "-1" },
+    { class: "verdict accept", tabindex: "-1" },
     h("p", { class: "verdict-word" }, answer.replaced ? "Enrolled again" : "Enrolled"),
-    h(
-      "ol",
-      { class: "used", "aria-label": "Photos used" },
-      thumbs.map((each, index) => h("li", {}, each, ` Photo ${index + 1}: ${answer.images[index]?.status ?? "used"}`)),
-    ),
+    h("ol", { class: "used", "aria-label": "Photos used" }, photos),
     facts([
       ["Person", id],
       ["Photos used", String(answer.images.length)],
       ["Earlier enrollment", answer.replaced ? "replaced" : "none"],
       ["Holder key", answer.holder_key ? "needed at every verification" : null],
     ]),
-    h(
-      "p",
-      { class: "row" },
-      h("a", { href: `#/verify/${encodeURIComponent(id)}` }, "Verify this person"),
-    ),
+    h("p", { class: "row" }, h("a", { href: `#/verify/${encodeURIComponent(id)}` }, "Verify this person")),
     h("p", { class: "fine" }, "Template ", h("code", {}, answer.template_id)),
   );
 }

@@ -1,6 +1,6 @@
 // Sign-in, navigation and focus; each view is a module of its own.
 
-import { carriesFiles, h, takesFiles } from "./dom.js";
+import { carriesFiles, field, h, takesFiles } from "./dom.js";
 import { enrollView } from "./enroll.js";
 import { peopleView } from "./people.js";
 import { serviceView } from "./status.js";
@@ -81,7 +81,6 @@ function signInView(problem = null) {
     required: true,
     autocomplete: "off",
     spellcheck: "false",
-    "aria-describedby": "key-hint",
   });
   const keep = h("input", { type: "checkbox", id: "keep", checked: true, "aria-describedby": "keep-hint" });
   const send = h("button", { type: "submit" }, "Sign in");
@@ -102,42 +101,28 @@ function signInView(problem = null) {
     useKey(token, keep.checked);
     try {
       await learn();
+      signedIn(true);
     } catch (error) {
       forgetKey();
       trouble.replaceChildren(problemBox(error));
       send.disabled = false;
       key.focus();
-      return;
     }
-    key.value = "";
-    signedIn(true);
   }
 
   const root = h(
     "section",
     { class: "sign-in" },
     h("h1", { tabindex: "-1" }, "Sign in"),
-    h(
-      "p",
-      { class: "lead" },
-      "Enroll people, verify them, and erase them.",
-    ),
+    h("p", { class: "lead" }, "Enroll people, verify them, and erase them."),
     h(
       "form",
       { class: "card", onsubmit: submit },
-      h(
-        "div",
-        { class: "field" },
-        h("label", { for: "key" }, "API key"),
-        key,
-        h(
-          "p",
-          { class: "hint", id: "key-hint" },
-          "The service prints one when it first starts; ",
-          h("code", {}, "veilface keys create"),
-          " creates more.",
-        ),
-      ),
+      field("API key", key, [
+        "The service prints one when it first starts; ",
+        h("code", {}, "veilface keys create"),
+        " creates more.",
+      ]),
       h("p", { class: "check" }, keep, h("label", { for: "keep" }, "Keep me signed in until I close this tab")),
       h(
         "p",

@@ -1,4 +1,4 @@
-import { command, download, facts, field, h, openDialog, when } from "./dom.js";
+import { command, confirmed, download, facts, field, h, when } from "./dom.js";
 import { call, may, subjectPath } from "./service.js";
 import { about, enroller, offNote, people } from "./subject.js";
 import { lacking, problemBox } from "./words.js";
@@ -16,7 +16,7 @@ export function peopleView() {
   const title = h("h1", { tabindex: "-1" }, "People");
   const why = may("enroll") ? null : lacking("enroll");
   let cursor = null;
-  let dialog = null;
+  const ended = new AbortController();
   let asked = 0;
   let timer = 0;
 
@@ -72,10 +72,7 @@ export function peopleView() {
         disabled: !erasing,
         title: erasing ? null : lacking("erase"),
         "aria-label": `Erase ${id}`,
-        onclick: () => {
-          const failed = (error) => problem.replaceChildren(problemBox(error));
-          dialog = confirmErasure(id, () => gone(id, item), failed);
-        },
+        onclick: () => eraseAsked(id, item),
       },
       "Erase…",
     );
@@ -94,15 +91,30 @@ export function peopleView() {
     return item;
   }
 
-  async function gone(id, item) {
+  async function eraseAsked(id, item) {
+    const agreed = await confirmed(
+      `Erase ${id}?`,
+      "This removes the template, its key and everything else that is kept about this person. It cannot " +
+        "be undone. You get a signed receipt.",
+      "Erase",
+      ended.signal,
+    );
+    if (!agreed) return;
     problem.replaceChildren();
-    const answer = await call("DELETE", subjectPath(id));
-    item.remove();
-    count();
-    const shown = receipt(id, answer);
-    // Those of earlier erasures stay: they may not have been downloaded yet.
-    receipts.prepend(shown);
-    return shown;
+    item.querySelector("button").disabled = true;
+    try {
+      const answer = await call("DELETE", subjectPath(id));
+      item.remove();
+      count();
+      const shown = receipt(id, answer);
+      // Those of earlier erasures stay: they may not have been downloaded yet.
+      receipts.prepend(shown);
+      shown.focus();
+    } catch (error) {
+      item.querySelector("button").disabled = false;
+      problem.replaceChildren(problemBox(error));
+      problem.scrollIntoView({ block: "nearest" });
+    }
   }
 
   const none = h(
@@ -117,7 +129,7 @@ export function peopleView() {
   if (!why) load();
   const stop = () => {
     clearTimeout(timer);
-    dialog?.close();
+    ended.abort();
   };
   const root = h(
     "section",
@@ -136,49 +148,6 @@ export function peopleView() {
     more,
   );
   return { root, stop };
-}
-
-// The dialog stays open during the work, so that a failure shows where it was caused; if the
-// browser closes it all the same, `failed` shows it.
-function confirmErasure(id, work, failed) {
-  const before = document.activeElement;
-  const problem = h("div", {});
-  const keep = h("button", { type: "button", class: "secondary", onclick: () => dialog.close() }, "Keep");
-  const erase = h(
-    "button",
-    {
-      type: "button",
-      class: "danger",
-      onclick: async () => {
-        erase.disabled = keep.disabled = true;
-        problem.replaceChildren();
-        try {
-          then = await work();
-          dialog.close();
-        } catch (error) {
-          if (dialog.open) problem.replaceChildren(problemBox(error));
-          else failed(error);
-          erase.disabled = keep.disabled = false;
-        }
-      },
-    },
-    "Erase",
-  );
-  // What has the focus afterwards; nothing outside can take it while the dialog is open.
-  let then = before;
-  const dialog = openDialog(
-    `Erase ${id}?`,
-    "This removes the template, its key and everything else that is kept about this person. It cannot " +
-      "be undone. You get a signed receipt.",
-    problem,
-    h("p", { class: "row" }, keep, erase),
-  );
-  dialog.addEventListener("cancel", (event) => {
-    if (erase.disabled) event.preventDefault();
-  });
-  dialog.addEventListener("close", () => then?.focus());
-  keep.focus();
-  return dialog;
 }
 
 function receipt(id, answer) {

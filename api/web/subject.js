@@ -1,5 +1,5 @@
-// The field for a person's id. People are searched by how their ids begin, and picked from a list, with
-// a key that may list them; with any other, and where the search fails, the id is typed.
+// The field for a person's id. With a key that may list people, the browser suggests those whose ids begin
+// so; with any other, and where the search fails, the id is typed.
 
 import { command, field, h, newId, when } from "./dom.js";
 import { LIFTS, call, may, session } from "./service.js";
@@ -49,7 +49,8 @@ export const switchOf = (mode) =>
 
 export function subjectField(id = "", listed = "Type how it begins, or pick from the list.") {
   const searches = may("enroll");
-  const list = h("ul", { class: "options", role: "listbox", id: newId("people"), "aria-label": "People", hidden: true });
+  const list = h("datalist", { id: newId("people") });
+  const told = h("p", { class: "hint", role: "status" });
   const input = h("input", {
     type: "text",
     required: true,
@@ -58,112 +59,46 @@ export function subjectField(id = "", listed = "Type how it begins, or pick from
     autocomplete: "off",
     autocapitalize: "none",
     spellcheck: "false",
+    list: searches ? list.id : null,
     value: id,
-    ...(searches
-      ? { role: "combobox", "aria-autocomplete": "list", "aria-expanded": "false", "aria-controls": list.id }
-      : {}),
   });
-  const told = h("p", { class: "hint", role: "status" });
   input.addEventListener("input", () => input.setCustomValidity(input.validity.patternMismatch ? SPELLING : ""));
   const part = field("Person's id", input, searches ? listed : SPELLING);
   if (!searches) return [input, part];
   let running = new AbortController();
   let timer = 0;
-  let active = -1;
 
-  function stop() {
-    clearTimeout(timer);
-    running.abort();
-    running = new AbortController();
-  }
-
-  function show(options) {
-    list.replaceChildren(...options);
-    list.hidden = !options.length;
-    input.setAttribute("aria-expanded", String(!list.hidden));
-    activate(-1);
-  }
-
-  function activate(index) {
-    active = index;
-    [...list.children].forEach((each, at) => each.setAttribute("aria-selected", String(at === index)));
-    const now = list.children[index];
-    now?.scrollIntoView({ block: "nearest" });
-    if (now) input.setAttribute("aria-activedescendant", now.id);
-    else input.removeAttribute("aria-activedescendant");
-  }
-
-  function pick(name) {
-    input.value = name;
-    show([]);
-    for (const type of ["input", "change"]) input.dispatchEvent(new Event(type, { bubbles: true }));
-  }
-
-  // `browses`: the visitor asked to see people, whatever is typed already.
-  async function search(browses) {
-    stop();
+  async function search() {
     const { signal } = running;
     const typed = input.value;
-    if (!browses && !typed) return tell("", []);
-    let found;
-    try {
-      found = await people(typed, { limit: SHOWN, signal });
-    } catch {
-      // It is an aid: what is wrong, the form says when it is sent.
-      return tell("", []);
-    }
-    if (signal.aborted || input.value !== typed) return;
-    const { subjects, next_cursor: more } = found;
-    const exact = subjects.find((each) => each.subject_id === typed);
-    const one = subjects.length === 1 ? "1 person" : `${subjects.length}${more ? " or more" : ""} people`;
-    if (exact && !browses) tell(["✓ ", about(exact)], []);
-    else if (!subjects.length) tell(typed ? "Nobody is enrolled under this id." : "Nobody is enrolled yet.", []);
-    else tell(typed ? `${one} found.` : `${one} enrolled.`, document.activeElement === input ? subjects : []);
-  }
-
-  function tell(words, subjects) {
-    told.replaceChildren(...[words].flat(2));
-    show(
-      subjects.map((each) =>
-        h(
-          "li",
-          {
-            role: "option",
-            id: newId("person"),
-            "aria-selected": "false",
-            // The field keeps the focus.
-            onmousedown: (event) => event.preventDefault(),
-            onclick: () => pick(each.subject_id),
-          },
-          h("strong", {}, each.subject_id),
-          h("span", { class: "fine" }, about(each)),
-        ),
+    // It is an aid: what is wrong, the form says when it is sent.
+    const found = await people(typed, { limit: SHOWN, signal }).catch(() => null);
+    if (signal.aborted) return;
+    told.replaceChildren(...(found ? said(found, typed) : []));
+    list.replaceChildren(
+      ...(found?.subjects ?? []).map((each) =>
+        h("option", { value: each.subject_id }, h("span", {}, about(each)).textContent),
       ),
     );
   }
 
   input.addEventListener("input", () => {
-    stop();
-    show([]);
+    clearTimeout(timer);
+    running.abort();
+    running = new AbortController();
     told.replaceChildren();
     timer = setTimeout(search, PAUSE_MS);
   });
-  input.addEventListener("click", () => input.value || search(true));
-  input.addEventListener("blur", () => show([]));
-  input.addEventListener("keydown", (event) => {
-    const count = list.children.length;
-    const open = !list.hidden;
-    if (event.key === "ArrowDown" && !open) search(true);
-    else if (event.key === "ArrowDown") activate((active + 1) % count);
-    else if (event.key === "ArrowUp" && open) activate((active <= 0 ? count : active) - 1);
-    else if (event.key === "Enter" && open && active >= 0) pick(list.children[active].firstChild.textContent);
-    else if (event.key === "Escape" && open) show([]);
-    else return;
-    event.preventDefault();
-  });
-  part.classList.add("combobox");
-  input.after(list);
-  part.append(told);
+  input.addEventListener("focus", () => input.value || list.childElementCount || search());
+  part.append(list, told);
   if (id) search();
   return [input, part];
+}
+
+function said({ subjects, next_cursor: more }, typed) {
+  const exact = subjects.find((each) => each.subject_id === typed);
+  if (exact) return ["✓ ", ...about(exact)];
+  if (!subjects.length) return [typed ? "Nobody is enrolled under this id." : "Nobody is enrolled yet."];
+  const one = subjects.length === 1 ? "1 person" : `${subjects.length}${more ? " or more" : ""} people`;
+  return [`${one} ${typed ? "found" : "enrolled"}.`];
 }

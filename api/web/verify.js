@@ -1,9 +1,8 @@
 import { headMovements } from "./challenge.js";
-import { facts, field, h, oneIn, percent, workbench } from "./dom.js";
-import { holderKey } from "./holder.js";
-import { photoPicker } from "./photos.js";
+import { facts, field, h, oneIn, percent } from "./dom.js";
+import { photoForm } from "./form.js";
 import { call, form, levels, may, moves, session, subjectPath } from "./service.js";
-import { enroller, offNote, subjectField, switchOf, whyOff } from "./subject.js";
+import { enroller } from "./subject.js";
 import { DEMO, livenessWords, problemBox } from "./words.js";
 
 const REASONS = {
@@ -29,11 +28,9 @@ const STEPS = {
 };
 
 export function verifyView(id) {
-  const why = whyOff("verify");
-  const [subject, subjectPart] = subjectField(id);
   const level = h(
     "select",
-    {},
+    { onchange: () => view.refresh() },
     levels().map((each) =>
       h(
         "option",
@@ -42,156 +39,63 @@ export function verifyView(id) {
       ),
     ),
   );
-  const result = h("div", { class: "result", role: "status" });
-  const problem = h("div", {});
-  const send = h("button", { type: "submit", disabled: true }, "Verify");
-  const say = (text) => (send.textContent = text);
-  // Counts what was asked: an answer to what is no longer on the page is not shown.
-  let asked = 0;
-  const clear = () => {
-    asked += 1;
-    result.replaceChildren();
-    problem.replaceChildren();
-  };
-  const picker = why
-    ? null
-    : photoPicker({
-        most: 5,
-        replaces: true,
-        onchange: (ready) => {
-          send.disabled = !(ready || moving());
-          clear();
-        },
-      });
-  const mode = why === null ? session.mode?.offer("verify", showWhatIsAsked) : null;
-  const movements = headMovements();
-  const moving = () => why === null && moves();
-  const instead = h("p", { class: "hint" }, "If you cannot turn your head, ask the operator for another way.");
-  const steps = [h("span", {}), h("span", {})];
+  const asked = () => (moves() ? "movements" : "photos");
 
-  function showWhatIsAsked() {
-    clear();
-    mode?.at(level.value, picker);
-    steps.forEach((step, index) => (step.textContent = STEPS[moving() ? "movements" : "photos"][index]));
-    if (!picker) return;
-    picker.root.hidden = moving();
-    if (moving()) picker.pause();
-    movements.root.hidden = instead.hidden = !moving();
-    say(moving() ? "Start head movements" : "Verify");
-    send.disabled = !(picker.ready() || moving());
-  }
-  const holder = holderKey("verify", subject, clear);
-  subject.addEventListener("input", clear);
-  level.addEventListener("change", showWhatIsAsked);
-
-  async function submit(event) {
-    event.preventDefault();
-    if (fields.disabled) return;
-    clear();
-    const asking = asked;
-    const name = subject.value;
-    const sent = picker.chosen();
-    const lifts = session.mode?.active();
-    fields.disabled = true;
-    try {
-      const holder_key = await holder.key(name, say);
-      const asksToMove = moving();
-      const { photos, ...shown } = asksToMove
-        ? await movements.frames(name)
-        : { photos: picker.blobs(), face: picker.face() };
-      say("Comparing…");
-      const given = { level: level.value, ...shown, holder_key };
-      const answer = await (lifts
-        ? session.mode.verify(name, { photos, ...given })
-        : call("POST", `${subjectPath(name)}/verify`, { body: form("images", photos, given) }));
-      if (asking === asked) {
-        result.replaceChildren(decision(name, answer, asksToMove ? "movements" : "photos"));
-        if (lifts) result.append(session.mode.whatLeft());
-        result.scrollIntoView({ block: "nearest" });
-      }
-    } catch (error) {
-      if (asking === asked) {
-        if (error.details && !moving()) picker.blame(error, sent);
-        problem.replaceChildren(problemBox(error));
-        if (error.code === "locked_out" && may("admin")) problem.append(lifter(name));
-        if (error.code === "not_enrolled" && may("enroll")) problem.append(enroller(name));
-        if (lifts) problem.append(session.mode.whatLeft());
-        problem.scrollIntoView({ block: "nearest" });
-      }
-    }
-    fields.disabled = false;
-    say(moving() ? "Start head movements" : "Verify");
-    send.disabled = !(picker.ready() || moving());
-    // A button that is switched off loses the focus.
-    if (document.activeElement === document.body) send.focus();
+  async function send(name, { photos, ...given }, { lifts, say }) {
+    say("Comparing…");
+    const fields = { level: level.value, ...given };
+    return lifts
+      ? lifts.verify(name, { photos, ...fields })
+      : call("POST", `${subjectPath(name)}/verify`, { body: form("images", photos, fields) });
   }
 
-  // For operators: the lock is lifted where it was met.
-  const lifter = (name) =>
-    h(
-      "button",
-      {
-        type: "button",
-        class: "secondary",
-        onclick: async () => {
-          try {
-            await call("DELETE", `${subjectPath(name)}/lockout`);
-            problem.replaceChildren(h("p", { class: "off", role: "status" }, `The lock on ${name} is lifted.`));
-            send.focus();
-          } catch (error) {
-            problem.prepend(problemBox(error));
-          }
-        },
-      },
-      "Lift the lock",
-    );
+  function remedies({ code }, name, { problem, send: button }) {
+    if (code === "locked_out" && may("admin")) return [lifter(name, problem, button)];
+    if (code === "not_enrolled" && may("enroll")) return [enroller(name)];
+    return [];
+  }
 
-  const fields = h(
-    "fieldset",
-    { class: "plain", disabled: why !== null },
-    h(
-      "div",
-      { class: "pair" },
-      subjectPart,
-      field("Level", level, "How often a stranger is accepted. Stricter levels reject the right person more often."),
-    ),
-    switchOf(mode),
-    picker?.root ?? null,
-    why ? null : movements.root,
-    instead,
-    holder.parts,
+  const view = photoForm(id, {
+    action: "verify",
+    title: "Verify",
+    lead: "Check whether photos show the person enrolled under an id. Several are averaged.",
+    beside: field("Level", level, "How often a stranger is accepted. Stricter levels reject the right person more often."),
+    heading: "The decision",
+    steps: () => ["Choose the person.", ...STEPS[asked()]],
+    most: 5,
+    replaces: true,
+    level: () => level.value,
+    movements: headMovements(),
+    moving: moves,
+    verb: () => (moves() ? "Start head movements" : "Verify"),
     send,
-  );
-
-  const entry = h("form", { class: "card", onsubmit: submit }, fields);
-  const root = h(
-    "section",
-    {},
-    h("h1", { tabindex: "-1" }, "Verify"),
-    h("p", { class: "lead" }, "Check whether photos show the person enrolled under an id. Several are averaged."),
-    offNote(why),
-    workbench(entry, "The decision", ["Choose the person.", ...steps], problem, result),
-  );
-  picker?.dropOn(entry);
-  showWhatIsAsked();
-  return {
-    root,
-    stop() {
-      asked += 1;
-      movements.stop();
-      holder.stop();
-      picker?.stop();
-    },
-  };
+    show: (name, answer) => decision(name, answer, asked()),
+    remedies,
+  });
+  return view;
 }
 
-function decision(id, answer, sent) {
+// For operators: the lock is lifted where it was met.
+function lifter(name, problem, button) {
+  const lift = async () => {
+    try {
+      await call("DELETE", `${subjectPath(name)}/lockout`);
+      problem.replaceChildren(h("p", { class: "off", role: "status" }, `The lock on ${name} is lifted.`));
+      button.focus();
+    } catch (error) {
+      problem.prepend(problemBox(error));
+    }
+  };
+  return h("button", { type: "button", class: "secondary", onclick: lift }, "Lift the lock");
+}
+
+function decision(id, answer, asked) {
   const accepted = answer.decision === "accept";
   return h(
     "div",
     { class: `verdict ${accepted ? "accept" : "reject"}` },
     h("p", { class: "verdict-word" }, accepted ? "✓ Accepted" : "✕ Rejected"),
-    h("p", {}, REASONS[answer.reason] ?? LIVENESS[sent]),
+    h("p", {}, REASONS[answer.reason] ?? LIVENESS[asked]),
     answer.advice ? h("p", {}, answer.advice) : null,
     facts([
       ["Person", id],

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Page, expect
 
+from models.demo import DEMO_NOTICE
 from tests.web.access import assert_accessible, findings
 from tests.web.camera import FakeCamera
 from tests.web.conftest import OpenTab
@@ -21,8 +22,10 @@ VIEWS = ("Verify", "Enroll", "People", "Service")
 def test_axe_finds_nothing_in_any_state_of_any_view(open_tab: OpenTab, demo: Served) -> None:
     tab = open_tab(demo, sign_in=None)
     seen = set()
+    mark = tab.page.get_by_text(DEMO_NOTICE, exact=True)
     for name in walk_demo(tab, demo):
         assert_accessible(tab, name)
+        expect(mark).to_be_in_viewport()
         seen.add(name.split("-")[0])
     assert seen >= {view.lower() for view in VIEWS}
 

@@ -9,8 +9,6 @@ import pytest
 from PIL import Image
 from playwright.sync_api import expect
 
-from tests.patience import wait_until
-from tests.web.answers import PendingRequests
 from tests.web.browser_tab import BrowserTab
 from tests.web.camera import FakeCamera
 from tests.web.conftest import OpenTab
@@ -209,20 +207,6 @@ HTMLCanvasElement.prototype.toBlob = function (...given) {
   return encode.apply(this, given);
 };
 """
-# When a picture is taken, and when the service is asked about one.
-NOTE = """
-window.noted = [];
-const { toBlob } = HTMLCanvasElement.prototype;
-HTMLCanvasElement.prototype.toBlob = function (...given) {
-  window.noted.push("taken");
-  return toBlob.apply(this, given);
-};
-const { fetch } = window;
-window.fetch = (path, ...given) => {
-  if (path.endsWith("/v1/photos/check")) window.noted.push("asked");
-  return fetch(path, ...given);
-};
-"""
 
 
 def test_one_click_takes_three_photos_and_drops_what_would_not_do(
@@ -246,27 +230,6 @@ def test_one_click_takes_three_photos_and_drops_what_would_not_do(
     page.get_by_role("button", name="Take 3 photos").click()
     expect(page.locator(".tray .seen[data-state=good]")).to_have_count(5)
     expect(page.locator(".refused")).to_be_empty()
-
-
-def test_a_burst_is_asked_about_while_it_is_taken_and_guidance_waits(
-    open_tab: OpenTab, demo: Served
-) -> None:
-    tab = open_tab(demo)
-    page = tab.page
-    tab.open("Enroll")
-    start(tab)
-    asked = PendingRequests(page, "**/v1/photos/check")
-    guidance = asked.wait()
-    page.evaluate(f"() => {{ {NOTE} }}")
-    page.get_by_role("button", name="Take 3 photos").click()
-    wait_until(lambda: len(page.evaluate("window.noted")) == 4, what="a burst")
-    assert page.evaluate("window.noted") == ["taken", "asked", "taken", "taken"]
-    guidance.continue_()
-    page.wait_for_timeout(2500)
-    assert len(page.evaluate("window.noted")) == 4
-    # What waits goes on.
-    page.unroute("**/v1/photos/check")
-    expect(page.get_by_role("button", name="Take 3 photos")).to_be_enabled()
 
 
 def test_photos_are_decoded_one_at_a_time(open_tab: OpenTab, demo: Served) -> None:

@@ -19,7 +19,7 @@ from tests.web.conftest import OpenTab
 from tests.web.deployments import ANNA
 from tests.web.moving_head import camera_script
 from tests.web.served import Served, serving
-from tests.web.walk_obstacles import DENY, START
+from tests.web.walk_obstacles import START
 from veilface_client import Client
 
 pytestmark = pytest.mark.long
@@ -142,16 +142,6 @@ def test_leaving_ends_the_camera_and_sends_nothing(open_tab: OpenTab, moving: Se
     assert page.evaluate("window.cameraTrack.readyState") == "ended"
     page.wait_for_timeout(3000)
     assert not any(url.endswith(("/v1/challenges", "/verify")) for url in tab.requests)
-
-
-def test_a_camera_that_is_refused_is_said(open_tab: OpenTab, moving: Served) -> None:
-    tab = open_tab(moving, sign_in=None)
-    tab.page.add_init_script(DENY)
-    tab.sign_in(moving.token)
-    tab.page.get_by_label("Person's id").fill("anna")
-    tab.page.get_by_role("button", name=START).click()
-    expect(tab.page.get_by_role("alert")).to_contain_text("Camera access was denied.")
-    expect(tab.page.get_by_role("button", name=START)).to_be_enabled()
 
 
 @pytest.mark.parametrize(

@@ -2,43 +2,18 @@
 
 import io
 import re
-from http.client import HTTPConnection
-from urllib.parse import urlsplit
 
 import httpx
 import pytest
 from playwright.sync_api import expect
 
-from models.demo import DEMO_NOTICE
 from tests.patience import PATIENCE_S
-from tests.web.camera import FakeCamera, browsers_test_picture
+from tests.web.camera import browsers_test_picture
 from tests.web.conftest import OpenTab
 from tests.web.served import Served
 from tests.web.walk import choose
 
 pytestmark = pytest.mark.long
-
-
-def test_a_visitor_enrolls_and_verifies_a_drawn_person(open_tab: OpenTab, demo: Served) -> None:
-    tab = open_tab(demo)
-    page = tab.page
-    tab.open("Enroll")
-    page.get_by_label("Person's id").fill("visitor")
-    for shot in (1, 2, 3):
-        choose(tab, "person-1", shot)
-    expect(page.locator(".tray li")).to_have_count(3)
-    page.get_by_role("button", name="Enroll", exact=True).click()
-    expect(page.locator(".verdict")).to_contain_text("Photos used3")
-    page.get_by_role("link", name="Verify this person").click()
-    choose(tab, "person-1", 4)
-    page.get_by_role("button", name="Verify", exact=True).click()
-    expect(page.locator(".verdict.accept")).to_contain_text("Accepted")
-    choose(tab, "person-101", 1)
-    expect(page.locator(".verdict")).to_have_count(0)
-    page.get_by_role("button", name="Verify", exact=True).click()
-    expect(page.locator(".verdict.reject")).to_contain_text("Rejected")
-    with demo.client() as client:
-        assert client.delete("/v1/subjects/visitor").is_success
 
 
 def test_an_enrollment_is_replaced_only_where_the_visitor_says_so(
@@ -90,38 +65,6 @@ def test_an_enrollment_is_replaced_only_where_the_visitor_says_so(
     assert template_id() != meanwhile
     with demo.client() as client:
         assert client.delete("/v1/subjects/visitor").is_success
-
-
-def test_every_screen_is_marked(open_tab: OpenTab, demo: Served) -> None:
-    tab = open_tab(demo, sign_in=None)
-    tab.page.goto(tab.url)
-    mark = tab.page.get_by_text(DEMO_NOTICE, exact=True)
-    expect(mark).to_be_visible()
-    tab.sign_in(demo.token)
-    for view in ("Verify", "Enroll", "People", "Service"):
-        tab.open(view)
-        expect(mark).to_be_visible()
-        expect(mark).to_be_in_viewport()
-
-
-def test_drawn_photos_are_the_demos_only_and_always_the_same(demo: Served) -> None:
-    with httpx.Client(base_url=demo.url, timeout=PATIENCE_S) as client:
-        listed = client.get("/demo/people").json()
-        assert listed["people"][0] == "person-1"
-        path = "/demo/people/person-1/0.png"
-        one, again = client.get(path), client.get(path)
-        assert one.headers["content-type"] == "image/png"
-        assert one.content == again.content
-        drawn = demo.settings.data_dir / "people" / "person-1" / "0.png"
-        assert one.content == drawn.read_bytes()
-    absent = ("person-9/0.png", "person-1/5.png", "person-1/00.png", "../../etc/0.png",
-              "../people/person-1/0.png", "person-1/../../../assets/main.js")  # fmt: skip
-    for each in ("person-1/0.png", *absent):
-        # Nothing resolves the dots on the way, as httpx and a browser would.
-        wire = HTTPConnection(urlsplit(demo.url).netloc, timeout=PATIENCE_S)
-        wire.request("GET", f"/demo/people/{each}")
-        assert wire.getresponse().status == (404 if each in absent else 200), each
-        wire.close()
 
 
 def test_people_come_page_by_page(open_tab: OpenTab, demo: Served) -> None:
@@ -176,28 +119,6 @@ def test_too_many_rejections_are_told_with_the_time_to_wait(
         page.get_by_role("button", name="Verify", exact=True).click()
         expect(page.locator(".verdict.accept")).to_be_visible()
         client.delete("/v1/subjects/locked")
-
-
-def test_the_test_picture_of_a_fake_camera_is_no_face(
-    open_tab: OpenTab, demo: Served, camera: FakeCamera
-) -> None:
-    camera.shows_the_browsers_test_picture()
-    tab = open_tab(demo)
-    page = tab.page
-    page.get_by_label("Camera", exact=True).check()
-    page.get_by_role("button", name="Start camera").click()
-    tab.guided("No cartoon face found")
-    page.get_by_role("button", name="Take 3 photos").click()
-    expect(page.locator(".refused")).to_contain_text(
-        "None of 3 photos taken. No cartoon face found"
-    )
-    expect(page.locator(".tray li")).to_have_count(0)
-    drawn = demo.settings.data_dir / "people" / "person-2" / "0.png"
-    page.get_by_label("Files", exact=True).check()
-    camera.shows(drawn)
-    page.get_by_label("Camera", exact=True).check()
-    page.get_by_role("button", name="Start camera").click()
-    tab.guided("Good: clear enough")
 
 
 def test_photos_are_numbered_from_one_in_the_tray_and_in_messages(

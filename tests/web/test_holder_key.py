@@ -13,7 +13,6 @@ from tests.web.browser_tab import BrowserTab
 from tests.web.conftest import OpenTab
 from tests.web.passkeys import Authenticator
 from tests.web.served import Served
-from tests.web.test_access import press_until
 from tests.web.walk import choose
 from tests.web.walk_obstacles import TO_FILE, TO_PASSKEY
 
@@ -286,21 +285,3 @@ def test_a_face_is_accepted_with_the_key_file_that_it_was_enrolled_with(
     visitor.is_refused("key_file", "That is no key file.")
     assert visitor.sent("/verify") == 2
     assert_kept_nowhere(visitor, own.read_text().strip(), local.log)
-
-
-def test_the_keyboard_alone_locks_an_enrollment(visit: Visit) -> None:
-    visitor = visit()
-    tab, page = visitor.tab, visitor.tab.page
-    tab.open("Enroll")
-    press_until(page, "input[type=text]")
-    page.keyboard.type(SUBJECT)
-    press_until(page, "button.shot")
-    page.keyboard.press("Enter")
-    expect(page.locator(".tray .seen[data-state=good]")).to_be_visible()
-    press_until(page, "input[type=radio][value=none]")
-    page.keyboard.press("ArrowDown")
-    expect(page.get_by_label(TO_PASSKEY)).to_be_focused()
-    expect(page.get_by_text("Every verification will ask for this passkey.")).to_be_visible()
-    press_until(page, "button[type=submit]")
-    page.keyboard.press("Enter")
-    expect(page.locator(".verdict")).to_contain_text("Holder key")

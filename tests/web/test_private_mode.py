@@ -3,7 +3,7 @@
 import base64
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -392,51 +392,40 @@ def test_a_key_without_embeddings_is_told_why(
     assert all("/assets/client/ort" not in url for url in tab.requests)
 
 
-def test_a_page_without_the_built_client_says_so(served: Served, open_tab: OpenTab) -> None:
-    tab = open_tab(served, sign_in=None)
-    page = tab.page
-
-    def not_built(route: Route) -> None:
-        answer = route.fetch()
-        route.fulfill(
-            response=answer,
-            body=answer.text().replace('data-client="yes"', 'data-client="no"'),
-        )
-
-    page.route(tab.url, not_built)
-    tab.sign_in(served.token)
-    expect(page.locator(".private")).to_contain_text("installed without the client that it needs")
-    expect(page.get_by_role("switch", name="Private mode")).to_be_hidden()
+def without_the_client(route: Route) -> None:
+    answer = route.fetch()
+    built = answer.text().replace('data-client="yes"', 'data-client="no"')
+    route.fulfill(response=answer, body=built)
 
 
-def test_a_level_of_a_smaller_dimension_than_the_browser_lifts_to_is_not_offered(
-    served: Served, open_tab: OpenTab
+def with_a_larger_dimension(route: Route) -> None:
+    """The browser lifts to the largest dimension, which has no levels here."""
+    answer = route.fetch()
+    told = answer.json()
+    (lifted, *_) = (each for each in told["calibrations"] if each["mode"] == "s2s")
+    told["calibrations"].append({**lifted, "probe_m": lifted["probe_m"] + 1, "levels": []})
+    route.fulfill(response=answer, json=told)
+
+
+@pytest.mark.parametrize(
+    ("path", "answer", "says"),
+    [
+        ("/", without_the_client, "installed without the client that it needs"),
+        ("/v1/contract", with_a_larger_dimension, "not calibrated for lifted probes"),
+        (
+            "/assets/private.js",
+            lambda route: route.fulfill(status=404),
+            "Private mode could not be loaded: photos are sent to the service",
+        ),
+    ],
+)
+def test_what_private_mode_lacks_is_said_and_keeps_nobody_out(
+    served: Served, open_tab: OpenTab, path: str, answer: Callable[[Route], None], says: str
 ) -> None:
     tab = open_tab(served, sign_in=None)
-
-    def with_a_larger_dimension(route: Route) -> None:
-        answer = route.fetch()
-        told = answer.json()
-        (lifted, *_) = (each for each in told["calibrations"] if each["mode"] == "s2s")
-        larger = {**lifted, "probe_m": lifted["probe_m"] + 1, "levels": []}
-        told["calibrations"].append(larger)
-        route.fulfill(response=answer, json=told)
-
-    tab.page.route("**/v1/contract", with_a_larger_dimension)
+    tab.page.route(served.url + path, answer)
     tab.sign_in(served.token)
-    expect(tab.page.locator(".private")).to_contain_text("not calibrated for lifted probes")
-
-
-def test_a_module_that_cannot_be_loaded_is_said_and_keeps_nobody_out(
-    served: Served, open_tab: OpenTab
-) -> None:
-    tab = open_tab(served, sign_in=None)
-    tab.page.route("**/assets/private.js", lambda route: route.fulfill(status=404))
-    tab.sign_in(served.token)
-    note = tab.page.get_by_text("Private mode could not be loaded")
-    for view in ("Verify", "Enroll"):
-        tab.page.get_by_role("link", name=view).first.click()
-        expect(note).to_contain_text("photos are sent to the service")
+    expect(tab.page.get_by_text(says)).to_be_visible()
 
 
 def test_what_keeps_private_mode_from_working_is_said_and_nothing_else_is_sent(
