@@ -87,7 +87,7 @@ def _demo_states(tab: BrowserTab, demo: Served) -> Iterator[str]:
     button("button", name="Verify", exact=True).click()
     expect(page.locator(".verdict.reject")).to_be_visible()
     yield "verify-rejected"
-    choose(tab, "person-1", 4)
+    choose(tab, "person-1", 5)
     button("button", name="Verify", exact=True).click()
     expect(page.locator(".verdict.accept")).to_be_visible()
     yield "verify-accepted"
