@@ -59,7 +59,9 @@ TEMPLATES_FAILED: list[tuple[list[str], str]] = [
 def refused(ran: Ran, reason: str, status: int) -> None:
     """One sentence on stderr says why, and nothing else is said."""
     assert (ran.status, ran.stdout) == (status, "")
-    (sentence,) = [line for line in ran.stderr.splitlines() if not line.startswith("note: ")]
+    # A bar that was shown, where embedding takes long, leaves an empty line.
+    lines = [line for line in ran.stderr.splitlines() if line]
+    (sentence,) = [line for line in lines if not line.startswith("note: ")]
     assert sentence.startswith("error: ")
     assert reason in sentence
     assert "defect" not in sentence
