@@ -36,7 +36,6 @@ FIELDS = frozenset(
         "version",
         "pack",
         "pid",
-        "ended_by",
     }
 )
 
