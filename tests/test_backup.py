@@ -1,4 +1,4 @@
-"""The commands of docs/backups.md: a database is backed up, lost and restored; what that undoes."""
+"""The commands of docs/deploy.md: a database is backed up, lost and restored; what that undoes."""
 
 import os
 import re
@@ -23,7 +23,8 @@ from tests.databases import empty_database, postgres_server
 pytestmark = pytest.mark.long
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGE = (ROOT / "docs" / "backups.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs" / "deploy.md").read_text(encoding="utf-8").split("\n## Backups\n")[1]
+PAGE = PAGE.split("\n## ")[0]
 BLOCKS = re.findall(r"^```sh\n(.*?)^```\n", PAGE, flags=re.M | re.S)
 TOLD = "anchor not in chain"
 

@@ -35,7 +35,7 @@ SERVICES = COMPOSE["services"]
 SECRETS = SERVICES["veilface"]["secrets"]
 DOCKERFILE = (ROOT / "deploy" / "Dockerfile").read_text()
 BIN = Path(sys.executable).parent
-PREPARE = block_under("deployment.md", "A container", "sh")
+PREPARE = block_under("deploy.md", "A container", "sh")
 POSTGRES_PORT = 5432
 
 # A root like this machine's, but with what is mounted: SOURCE TARGET … -- PROGRAM ARGUMENT …

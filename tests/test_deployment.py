@@ -75,7 +75,7 @@ def test_every_image_from_elsewhere_can_be_pinned_as_the_page_says() -> None:
     assert f"ARG BASE={images['VEILFACE_BASE_IMAGE']}\n" in DOCKERFILE
     assert re.findall(r"^FROM (\S+)", DOCKERFILE, re.M) == ["${BUILD_BASE}", "${BASE}"]
     assert "ARG BUILD_BASE=${BASE}\n" in DOCKERFILE
-    page = (ROOT / "docs" / "deployment.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "deploy.md").read_text(encoding="utf-8")
     for variable, image in images.items():
         assert f"{variable}=$(pinned {image})" in page
 

@@ -1,4 +1,4 @@
-"""nginx before two hosts, as docs/deployment.md has it."""
+"""nginx before two hosts, as docs/deploy.md has it."""
 
 import os
 import re
@@ -16,7 +16,7 @@ from tests.patience import PATIENCE_S, wait_until
 from tests.ports import free_port
 from tests.reliability.service import ROOT
 
-PAGE = (ROOT / "docs" / "deployment.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs" / "deploy.md").read_text(encoding="utf-8")
 NAME = "faces.example.org"
 
 

@@ -1,4 +1,4 @@
-"""deploy/veilface.service under a systemd that runs, installed as docs/deployment.md says."""
+"""deploy/veilface.service under a systemd that runs, installed as docs/deploy.md says."""
 
 import json
 import re
@@ -19,8 +19,8 @@ from tests.reliability.systemd import Machine
 
 pytestmark = pytest.mark.long
 
-SETTINGS = block_under("deployment.md", "systemd", "toml")
-INSTALL = block_under("deployment.md", "systemd", "sh")
+SETTINGS = block_under("deploy.md", "systemd", "toml")
+INSTALL = block_under("deploy.md", "systemd", "sh")
 UNIT = (ROOT / "deploy" / "veilface.service").read_text()
 PYTHON = "/opt/veilface/bin/python"
 URL = "http://127.0.0.1:8421"

@@ -1,6 +1,6 @@
 """Two hosts decide as one: both up, one cut off inside a write, one killed inside a write.
 
-And nginx before them, as docs/deployment.md has it.
+And nginx before them, as docs/deploy.md has it.
 """
 
 import itertools

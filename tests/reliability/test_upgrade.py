@@ -1,4 +1,4 @@
-"""An upgrade as docs/deployment.md has it: requests go on all the time, and none fails.
+"""An upgrade as docs/deploy.md has it: requests go on all the time, and none fails.
 
 The version that comes next is this one, under another path.
 """
@@ -27,7 +27,7 @@ from tests.reliability.operations import Clients, Operation, People
 from tests.reliability.service import ROOT, Service
 from tests.reliability.switch import Switch
 
-PAGE = (ROOT / "docs" / "deployment.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs" / "deploy.md").read_text(encoding="utf-8")
 PEOPLE = {"ann": 1, "ben": 2, "cas": 3}
 
 

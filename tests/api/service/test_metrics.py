@@ -201,7 +201,7 @@ def test_a_step_is_measured_even_if_it_fails() -> None:
 
 
 def test_operations_md_explains_every_metric_and_no_other() -> None:
-    text = (Path(__file__).resolve().parents[3] / "docs" / "operations.md").read_text()
+    text = (Path(__file__).resolve().parents[3] / "docs" / "deploy.md").read_text()
     told = set(re.findall(r"^\| `(veilface_[a-z_]+)` ", text, re.MULTILINE))
     families = list(text_string_to_metric_families(exposition().decode()))
     known = {
