@@ -19,9 +19,13 @@ MAX_FRAMING_BYTES = 16 * 1024
 FRAMING_SHARE = 8
 """So many bytes of body allow one further byte of framing, which chunks of 64 bytes need."""
 
+MAX_PIPELINED = 16
+"""Requests that may wait on a connection for the answer to an earlier one. uvicorn keeps all that
+one read brings, at about 1 kB each, before anybody has shown a key."""
+
 
 class Protocol(HttpToolsProtocol):
-    """uvicorn's protocol, which refuses a request whose framing is too large."""
+    """uvicorn's protocol, which refuses too large a framing and too many requests at once."""
 
     _framing_bytes = 0
 
@@ -37,6 +41,13 @@ class Protocol(HttpToolsProtocol):
                 self.send_400_response(
                     f"headers and chunk sizes have more than {MAX_FRAMING_BYTES} bytes: send fewer "
                     "or shorter headers, and the body with a Content-Length or in larger chunks"
+                )
+                return
+            if len(self.pipeline) > MAX_PIPELINED:
+                self.pipeline.clear()
+                self.send_400_response(
+                    f"more than {MAX_PIPELINED} requests wait for answers on one connection: send "
+                    "fewer before you read"
                 )
                 return
 

@@ -112,6 +112,12 @@ def test_requests_in_a_row_and_in_one_piece_are_answered(server: Server) -> None
             assert seen.count(b"HTTP/1.1 200 ") == 2
 
 
+def test_a_flood_of_requests_on_one_connection_ends_it(server: Server) -> None:
+    with connect(server) as raw:
+        seen = exchange(raw, SMUGGLED * 4_000)
+    assert seen.count(b"HTTP/1.1 200 ") < 4_000
+
+
 PUT = b"PUT /v1/subjects/a/enrollment HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n"
 
 
