@@ -19,7 +19,6 @@ from api.service.server import listen, run_server, tls_options
 from api.settings import Settings
 from templates.contract.document import Contract
 from templates.decoys import DecoyGenerator
-from templates.store import TemplateStore
 
 
 @takes_settings(*Settings.model_fields)
@@ -33,14 +32,14 @@ def serve(
     """Start the REST service.
 
     Needs: a contract file (from `veilface calibrate`), and to accept photos also the model pack and
-    the decoys file of that contract. The database is created or migrated first. The very first
-    start prints an API key with all rights, once: keep it. Stop with Ctrl-C or SIGTERM; requests in
+    the decoys file of that contract. The database is created or migrated first. API keys
+    come from `veilface setup` or `veilface keys create`. Stop with Ctrl-C or SIGTERM; requests in
     progress are finished.
 
     Example: `veilface serve --pack buffalo_l --data-dir veilface-data --workers 2`
     """
     with _ended_by_sigterm():
-        contract = _check(settings, first_key=not check)
+        contract = _check(settings)
         binding = contract.binding
         if demo_notice(binding.embedder_sha256, n=binding.n) and not settings.demo:
             settings = settings.model_copy(update={"demo": True})
@@ -74,11 +73,8 @@ def service_url(settings: Settings, *, port: int | None = None) -> str:
     return f"{scheme}://{host}:{port or settings.port}"
 
 
-def _check(settings: Settings, *, first_key: bool) -> Contract:
-    """Open everything, models included, say what an operator should know, and let go of it again.
-
-    The first API key is made and shown where there is none, unless this is a mere check.
-    """
+def _check(settings: Settings) -> Contract:
+    """Open everything, models included, say what an operator should know, and close it again."""
     tls_options(settings)
     RateLimits.open(settings)
     runtime = Runtime.open(settings)
@@ -92,15 +88,8 @@ def _check(settings: Settings, *, first_key: bool) -> Contract:
         browsers_lift = settings.serve_pack and isinstance(runtime.source, DecoyGenerator)
         if browsers_lift and (weakness := private_mode_weakness(runtime.contract)) is not None:
             message(f"warning: private mode: {weakness}")
-        if first_key:
-            _show_first_key(runtime.store, settings)
+        if not runtime.store.api_keys.all():
+            message("there is no API key yet: `veilface keys create --out FILE` makes one")
         return runtime.contract
     finally:
         runtime.close()
-
-
-def _show_first_key(store: TemplateStore, settings: Settings) -> None:
-    made = store.api_keys.bootstrap(tenant=settings.default_tenant)
-    if made is not None:
-        said = f"API key with all rights of tenant {settings.default_tenant}, shown only now:"
-        say(f"{said}\n{made.token}")

@@ -27,9 +27,9 @@ from templates.contract.levels import LEVEL_NAME
 from templates.errors import StoreError
 from templates.keys.api_token import TOKEN
 from templates.keys.sealing import encode_parts
-from templates.store.audit_log import PROGRAM, TENANT_ERASE, By, Entry
+from templates.store.audit_log import PROGRAM, By, Entry
 from templates.store.context import StoreContext
-from templates.store.schema import ApiKeyRow, AuditHeadRow, AuditRow, TenantRow
+from templates.store.schema import ApiKeyRow, TenantRow
 from templates.store.secrets import SecretName
 from templates.store.tenants import Tenants, tenant_id_of
 
@@ -125,34 +125,6 @@ class ApiKeys:
             raise StoreError("the lowest level of a key is the name of a level, such as fmr-1e-4")
         key = self._drawn(tenant, granted, label, expires_at, lowest_level)
         return self._context.database.write(lambda connection: self._insert(connection, key, by))
-
-    def bootstrap(
-        self,
-        *,
-        tenant: str = "default",
-        rights: Iterable[Right] = tuple(Right),
-        by: By = PROGRAM,
-    ) -> NewApiKey | None:
-        """Make the first tenant and the first key, once in the life of a store.
-
-        Of any number of processes that call this at once, one gets the key and the others None.
-        """
-        granted = _rights(rights)
-
-        def work(connection: Connection) -> NewApiKey | None:
-            had_keys = (
-                sa.select(ApiKeyRow.id).limit(1),
-                sa.select(AuditRow.sequence)
-                .where(AuditRow.action.in_(("key-create", TENANT_ERASE)))
-                .limit(1),
-                sa.select(AuditHeadRow.id).where(AuditHeadRow.base_sequence > 0),
-            )
-            if any(connection.execute(query).first() is not None for query in had_keys):
-                return None
-            self._tenants.ensure(connection, tenant)
-            return self._insert(connection, self._drawn(tenant, granted, "bootstrap"), by)
-
-        return self._context.database.write(work)
 
     def verify(self, token: str) -> ApiKey | None:
         """Return the key of a token, or None if it is unknown, wrong, expired or revoked.

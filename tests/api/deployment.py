@@ -27,6 +27,7 @@ from templates.decoys import DecoyGenerator, DecoySource
 from templates.distances import DEFAULT_STEPS, Metric
 from templates.keys.rotation import ROTATION_VERSION
 from templates.space.lifting import Strategy
+from templates.store.api_keys import Right
 from tests.databases import migrate_ahead
 
 N = 64
@@ -188,10 +189,10 @@ def deploy(folder: Path, *, database_url: str | None = None, **changes: Any) -> 
     store = open_store(settings, keyring)
     try:
         prepare_database(store)
-        first = store.api_keys.bootstrap(tenant=settings.default_tenant)
+        store.tenants.create(settings.default_tenant)
+        first = store.api_keys.create(settings.default_tenant, tuple(Right))
     finally:
         store.close()
-    assert first is not None
     return Deployment(settings, first.token, contract, source)
 
 

@@ -1,10 +1,8 @@
-import contextlib
 import hashlib
 import hmac
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
-from pathlib import Path
 from unittest import mock
 
 import pytest
@@ -13,7 +11,6 @@ import sqlalchemy as sa
 from templates.errors import StoreError
 from templates.keys.sealing import MasterKeyring
 from templates.store import By, Right, TemplateStore, UnknownTenant
-from templates.store.api_keys import NewApiKey
 from templates.store.database import Database
 from templates.store.schema import ApiKeyRow
 from tests.templates.store.conftest import Clock
@@ -133,50 +130,6 @@ def test_nonsense_is_refused(store: TemplateStore) -> None:
     for label in ("x" * 129, "a\nb"):
         with pytest.raises(StoreError, match="label"):
             store.api_keys.create("default", [Right.VERIFY], label=label)
-
-
-def test_bootstrap_happens_once(database_url: str, keyring: MasterKeyring) -> None:
-    made: list[NewApiKey | None] = []
-    first_start = TemplateStore(database_url, keyring)
-    first_start.upgrade()
-    first_start.close()
-    start = threading.Barrier(6)
-
-    def worker() -> None:
-        store = TemplateStore(database_url, keyring)
-        start.wait()
-        made.append(store.api_keys.bootstrap())
-        store.close()
-
-    threads = [threading.Thread(target=worker) for _ in range(6)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    (first,) = [new for new in made if new is not None]
-    assert len(made) == 6
-    store = TemplateStore(database_url, keyring)
-    assert store.api_keys.bootstrap() is None
-    found = store.api_keys.verify(first.token)
-    assert found is not None
-    assert found.tenant == "default"
-    assert Right.ADMIN in found.rights
-    store.api_keys.revoke(found.prefix)
-    assert store.api_keys.bootstrap() is None  # not even when no key is left
-    store.close()
-
-
-def test_an_archive_does_not_let_the_first_key_be_made_again(
-    database_url: str,
-    keyring: MasterKeyring,
-    tmp_path: Path,
-) -> None:
-    with contextlib.closing(TemplateStore(database_url, keyring)) as store:
-        store.upgrade()
-        assert store.api_keys.bootstrap() is not None
-        store.erasures.erase_tenant("default")
-        store.archive_audit_log(tmp_path / "archive", through=None)
-        assert store.api_keys.bootstrap() is None
 
 
 def audit(store: TemplateStore) -> list[tuple[str, str, str | None]]:

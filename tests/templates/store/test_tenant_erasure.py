@@ -174,13 +174,6 @@ def test_a_receipt_of_a_tenant_survives_json_and_shows_alteration(store: Templat
         verify_receipt(altered, key)
 
 
-def test_no_second_bootstrap_key_after_the_only_tenant_is_erased(store: TemplateStore) -> None:
-    assert store.api_keys.bootstrap() is not None
-    store.erasures.erase_tenant("default")
-    assert count(store.database, ApiKeyRow) == 0
-    assert store.api_keys.bootstrap() is None
-
-
 @pytest.mark.parametrize("tenant_goes_first", [False, True])
 def test_concurrent_enrollments_leave_nothing(
     store: TemplateStore, database_url: str, key_file: Path, tenant_goes_first: bool
