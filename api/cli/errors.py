@@ -20,7 +20,7 @@ USAGE = 2
 NO_DECISION = 3
 _FAILED_STATUS = {"verify": NO_DECISION}  # where 1 is an answer
 EXTRAS = {
-    "evaluate": ("matplotlib", "numba", "pandas"),
+    "evaluate": ("matplotlib", "numba", "pandas", "scipy"),
     "audit": ("matplotlib", "sklearn"),
     "cluster": ("distributed",),
     "postgres": ("psycopg",),

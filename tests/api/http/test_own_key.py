@@ -13,7 +13,7 @@ def test_a_key_sees_what_it_is(client: Client, deployment: Deployment) -> None:
     body = assert_answer(client.get("/v1/key"), 200, KeyAnswer)
     assert body["tenant"] == "default"
     assert body["rights"] == [
-        "enroll", "verify", "erase", "export", "scores", "embeddings", "admin",
+        "enroll", "verify", "erase", "export", "scores", "embeddings", "metrics", "admin",
     ]  # fmt: skip
     assert body["expires_at"] is None
     assert body["demo"] is False
