@@ -34,6 +34,7 @@ from templates.keys.rotation import SignedCosineRotation, TenantRotation
 from templates.keys.sealing import MasterKeyring
 from templates.space.lifting import Strategy, lift
 from templates.store import TemplateStore
+from templates.store.api_keys import Right
 from tests.leak_material import PEOPLE, PROBE_M, Material, Photo
 from tests.leak_places import (
     copied_tables,
@@ -241,12 +242,16 @@ def exercise(material: Material, folder: Path, *, database_url: str) -> ServiceT
         )  # fmt: skip
     try:
         url = _await_ready(process, folder)
+        rights = [word for right in Right for word in ("--right", right)]
+        made = subprocess.run(
+            [sys.executable, "-m", "veilface", "keys", "create", *rights, "--json"],
+            cwd=ROOT, env=environment, check=True, capture_output=True,
+        )  # fmt: skip
+        traces.token = json.loads(made.stdout)["token"]
         subprocess.run(
             [sys.executable, "-m", "veilface", "db", "template-enrollment", "--allow"],
             cwd=ROOT, env=environment, check=True, capture_output=True,
         )  # fmt: skip
-        words = (folder / "out").read_text().split()
-        (traces.token,) = [word for word in words if word.startswith("vf_")]
         headers = {"Authorization": f"Bearer {traces.token}"}
         with httpx.Client(base_url=url, headers=headers, timeout=PATIENCE_S) as client:
             client.event_hooks["response"] = [lambda answer: _keep(traces, answer)]

@@ -40,10 +40,10 @@ def snippets(root: Path) -> list[Snippet]:
     return blocks
 
 
-def block_under(page: str, heading: str, kind: str) -> str:
-    """Return the first block of a language below a heading of a page of ``docs/``."""
+def block_under(page: str, heading: str, kind: str, number: int = 0) -> str:
+    """Return a block of a language below a heading of a page of ``docs/``, by its number."""
     text = (ROOT / "docs" / page).read_text(encoding="utf-8")
     section = re.split(rf"^## {re.escape(heading)}$", text, flags=re.M)[1]
-    match = re.search(rf"^```{kind}\n(.*?)^```$", section.split("\n## ")[0], flags=re.M | re.S)
-    assert match, f"docs/{page} has no block of {kind} under {heading}"
-    return match[1]
+    blocks = re.findall(rf"^```{kind}\n(.*?)^```$", section.split("\n## ")[0], flags=re.M | re.S)
+    assert len(blocks) > number, f"docs/{page} lacks a block of {kind} under {heading}"
+    return str(blocks[number])

@@ -187,6 +187,9 @@ def test_the_services_of_the_file_work_together(
             return composed.start(*words(r"    CMD")).wait() == 0
 
         wait_until(is_healthy, every_s=1)
+        rights = ["--right", "enroll", "--right", "verify"]
+        made = composed.start(*words("ENTRYPOINT"), "keys", "create", *rights)
+        assert made.wait(timeout=PATIENCE_S) == 0, composed.log.read_text()
         (token,) = set(re.findall(r"vf_\w+", composed.log.read_text()))
         url = f"http://{network.address_of(0)}:8421"
         with httpx.Client(

@@ -1,16 +1,15 @@
 """Bringing a database to the schema of this program, and finding out whether it is there."""
 
-import functools
 from pathlib import Path
 
-from alembic import command
-from alembic.config import Config
-from alembic.runtime.migration import MigrationContext
-from alembic.script import ScriptDirectory
+import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
 from templates.errors import StoreError
 from templates.store.database import Database
+
+MIGRATIONS = Path(__file__).with_name("migrations")
+_VERSION = sa.table("alembic_version", sa.column("version_num"))
 
 
 def upgrade(database: Database) -> None:
@@ -26,7 +25,7 @@ def upgrade(database: Database) -> None:
         present = _revision_of(connection)
         _require_known(present)
         if present != head_revision():
-            command.upgrade(_config(connection), "head")
+            _migrate(connection)
 
     database.write(work, wait=0)
 
@@ -38,9 +37,13 @@ def current_revision(database: Database) -> str | None:
 
 def head_revision() -> str:
     """Revision this program needs."""
-    head = _scripts().get_current_head()
-    assert head is not None, "the package holds at least one migration"  # noqa: S101
-    return head
+    return known_revisions()[-1]
+
+
+def known_revisions() -> tuple[str, ...]:
+    """Revisions that this program brings, the oldest first: file ``0001_….py`` has ``0001``."""
+    scripts = (MIGRATIONS / "versions").glob("[0-9]*.py")
+    return tuple(sorted(script.stem.split("_")[0] for script in scripts))
 
 
 def check(database: Database) -> None:
@@ -57,28 +60,27 @@ def check(database: Database) -> None:
 
 
 def _revision_of(connection: Connection) -> str | None:
-    return MigrationContext.configure(connection).get_current_revision()
+    if not sa.inspect(connection).has_table(_VERSION.name):
+        return None
+    revision: str | None = connection.scalar(sa.select(_VERSION.c.version_num))
+    return revision
 
 
 def _require_known(revision: str | None) -> None:
-    known = {script.revision for script in _scripts().walk_revisions()}
-    if revision is not None and revision not in known:
+    if revision is not None and revision not in known_revisions():
         raise StoreError(
             f"the database is at schema {revision}, which this program does not know: "
             "another version migrated it, install that one"
         )
 
 
-@functools.cache
-def _scripts() -> ScriptDirectory:
-    return ScriptDirectory.from_config(_config(None))
+def _migrate(connection: Connection) -> None:
+    # Imported here: a worker that finds the right schema does without, and its 11 MB.
+    from alembic import command
+    from alembic.config import Config
 
-
-def _config(connection: Connection | None) -> Config:
     config = Config()
-    config.set_main_option(
-        "script_location", str(Path(__file__).with_name("migrations")).replace("%", "%%")
-    )
+    config.set_main_option("script_location", str(MIGRATIONS).replace("%", "%%"))
     config.set_main_option("path_separator", "newline")
     config.attributes["connection"] = connection
-    return config
+    command.upgrade(config, "head")

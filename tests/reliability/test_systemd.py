@@ -21,6 +21,7 @@ pytestmark = pytest.mark.long
 
 SETTINGS = block_under("deploy.md", "systemd", "toml")
 INSTALL = block_under("deploy.md", "systemd", "sh")
+MAKE_KEY = block_under("deploy.md", "systemd", "sh", 1)
 UNIT = (ROOT / "deploy" / "veilface.service").read_text()
 PYTHON = "/opt/veilface/bin/python"
 URL = "http://127.0.0.1:8421"
@@ -149,7 +150,8 @@ def test_the_service_starts_serves_comes_back_and_stops(machine: Machine) -> Non
     override.write_text(ONE_WORKER)
     install(machine)
     unit.wait_for(workers=1)
-    token = next(line for line in unit.log() if line.startswith("vf_"))
+    machine.run("sh", "-euc", MAKE_KEY)
+    token = machine.run("cat", "/var/lib/veilface/api-key")
     with httpx.Client(
         base_url=URL, headers=bearer(token), timeout=PATIENCE_S, trust_env=False
     ) as http:

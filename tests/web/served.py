@@ -14,6 +14,7 @@ import pytest
 
 from api.service.runtime import open_keyring, open_store
 from api.settings import Settings
+from templates.store.api_keys import Right
 from tests.patience import PATIENCE_S
 from tests.ports import free_port
 
@@ -31,6 +32,7 @@ class Served:
         """Make another API key; return its token."""
         store = open_store(self.settings, open_keyring(self.settings))
         try:
+            store.tenants.create("default")
             return store.api_keys.create("default", rights).token
         finally:
             store.close()
@@ -46,16 +48,16 @@ class Served:
 def serving(
     folder: Path, settings: Settings, *options: str, token: str | None = None
 ) -> Iterator[Served]:
-    """Start the command with these options; without a token, take the one that it prints."""
+    """Start the command with these options; without a token, make a key with all rights."""
     port = free_port()
-    log, shown = folder / "page.log", folder / "page.out"
+    log = folder / "page.log"
     # Every tab asks for the whole page anew: dozens a minute are more than one address may.
     options = (*options, "--port", str(port), "--rate-limit-address", "off")
     environment = {k: v for k, v in os.environ.items() if not k.startswith("VEILFACE_")}
-    with log.open("wb") as errors, shown.open("wb") as output:
+    with log.open("wb") as errors:
         process = subprocess.Popen(
             [sys.executable, "-m", "veilface", "serve", *options],
-            stdout=output,
+            stdout=subprocess.DEVNULL,
             stderr=errors,
             env={**environment, "PYTHONUNBUFFERED": "1", "OMP_NUM_THREADS": "1"},
         )
@@ -63,7 +65,7 @@ def serving(
         url = f"http://127.0.0.1:{port}"
         _wait(process, url, log)
         if token is None:
-            token = next(line for line in shown.read_text().splitlines() if line.startswith("vf_"))
+            token = Served(url, "", settings, log).key(*Right)
         yield Served(url, token, settings, log)
     finally:
         process.terminate()

@@ -4,6 +4,8 @@ from pathlib import Path
 
 import pytest
 import sqlalchemy as sa
+from alembic.config import Config
+from alembic.script import ScriptDirectory
 
 from templates.errors import SealError, StoreError
 from templates.keys.sealing import MasterKeyring
@@ -109,3 +111,11 @@ def test_migrating_leaves_logging_alone(database_url: str) -> None:
     assert (logging.root.level, logging.root.handlers) == (level, handlers)
     assert not logging.getLogger("templates").disabled
     database.close()
+
+
+def test_files_are_named_by_their_revisions() -> None:
+    config = Config()
+    config.set_main_option("script_location", str(migrate.MIGRATIONS))
+    config.set_main_option("path_separator", "newline")
+    scripts = ScriptDirectory.from_config(config).walk_revisions()
+    assert tuple(script.revision for script in scripts)[::-1] == migrate.known_revisions()
