@@ -100,7 +100,11 @@ class Unit:
 
         wait_until(serve, what="the service", every_s=0.2)
         wait_until(self.is_healthy, what="its health check")
-        assert sum('"event": "started"' in line for line in self.log()) == workers
+
+        def started() -> int:
+            return sum('"event": "started"' in line for line in self.log())
+
+        wait_until(lambda: started() == workers, what="all workers")
 
 
 def decisions(http: httpx.Client, subject: str) -> list[str]:
