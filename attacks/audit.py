@@ -202,9 +202,9 @@ def audit_bed(
         seed=plan.seed,
     )
     bed = setup.bed(strategy, axes=source.k, m=m, contract=contract)
-    return replace(
-        bed, albums=population.albums, owners=population.owners.along(source), effort=plan.effort
-    )
+    # The owners are those of the pool that is compared with, and of no pool of the deployment.
+    owners = population.owners.along(source) if compared else None
+    return replace(bed, albums=population.albums, owners=owners, effort=plan.effort)
 
 
 def _calibrated(

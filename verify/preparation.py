@@ -82,7 +82,8 @@ def without_lookalikes(extraction: Extraction) -> Extraction:
         tile = rows[start : start + _TILE]
         alike = tile @ rows[: start + len(tile)].T >= LOOKALIKE
         for row in np.flatnonzero(alike.sum(axis=1) > 1):
-            stays[start + row] = not (alike[row] & stays)[: start + row].any()
+            earlier = slice(start + row)
+            stays[start + row] = not (alike[row, earlier] & stays[earlier]).any()
     kept = np.flatnonzero(stays).tolist()
     return Extraction(
         rows[kept],

@@ -87,6 +87,7 @@ def create(
     Example: `veilface keys create --right enroll --right verify --label web-shop`
     """
     name = tenant or settings.default_tenant
+    _require_new(out)
     with opened_store(settings) as store:
         store.tenants.create(name)
         expires = None if days is None else utc_now() + timedelta(days=days)
@@ -173,11 +174,19 @@ def replace(
 
     Example: `veilface keys replace 3f9a1c0b7d2e --grace-hours 48`
     """
+    _require_new(out)
     with opened_store(settings) as store:
         made = store.api_keys.replace(prefix, grace=timedelta(hours=grace_hours), by=operator())
     if made is None:
         raise CommandError("no valid key of this prefix; see `veilface keys list`")
     return _shown_once(made, f"Key {made.key.prefix} replaces {prefix}", out, replaces=prefix)
+
+
+def _require_new(out: Path | None) -> None:
+    """Refuse a file that cannot be made, before a key is made or replaced for it."""
+    if out is not None and (out.exists() or not out.parent.is_dir()):
+        why = "exists already" if out.exists() else "lies in a folder that does not exist"
+        raise CommandError(f"{out} {why}: name another file with --out")
 
 
 def _shown_once(made: NewApiKey, what: str, out: Path | None, **facts: str) -> Result:

@@ -3,7 +3,8 @@
 from datetime import UTC, datetime
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, PlainSerializer
+from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, PlainSerializer
+from pydantic_core import CoreSchema
 
 from api.http.errors import ERROR_CODES
 from templates.store.api_keys import Right
@@ -36,8 +37,20 @@ class _Shape(BaseModel):
 
 
 class _Answer(_Shape):
+    """What every answer has besides its own, which comes first."""
+
     request_id: str = Field(description="Also in X-Request-ID.", examples=[REQUEST_ID])
     notice: str | None = Field(None, description="Only with the demo model.", exclude_if=_is_none)
+
+    @classmethod
+    def __get_pydantic_core_schema__(
+        cls, source: type[BaseModel], handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
+        schema: Any = handler(source)
+        fields = schema["schema"]["fields"]
+        for name in ("notice", "request_id"):
+            fields[name] = fields.pop(name)
+        return schema  # type: ignore[no-any-return]
 
 
 class ErrorBody(_Shape):

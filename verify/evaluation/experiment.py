@@ -191,7 +191,7 @@ def trials_of(
         kept=kept,
         failed_genuine=pairs.genuine - genuine,
         failed_impostor=pairs.impostor - (len(same) - genuine),
-        fta=len(faces.failures) / len(pairs.pictures),
+        fta=float(np.mean(faces.rows < 0)),
     )
 
 

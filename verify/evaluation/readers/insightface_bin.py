@@ -128,10 +128,14 @@ class _Array:
     """Stands for an array: NumPy's own trusts the state that a pickle gives it."""
 
     def __init__(self, *_: object) -> None:
-        self.state: Any = None
+        self.state: Any = (1, (0,), _Type("O8"), False, [])
 
     def __setstate__(self, state: Any) -> None:
-        self.state = state
+        match state:
+            case (_, tuple(), _Type(), _, bytes() | list()):
+                self.state = state
+            case _:
+                raise pickle.UnpicklingError("an array's shape, type and content are not given")
 
     def values(self) -> list[Any] | None:
         """Return the elements of an array of one dimension."""
