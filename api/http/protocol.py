@@ -44,7 +44,6 @@ class Protocol(HttpToolsProtocol):
                 )
                 return
             if len(self.pipeline) > MAX_PIPELINED:
-                self.pipeline.clear()
                 self.send_400_response(
                     f"more than {MAX_PIPELINED} requests wait for answers on one connection: send "
                     "fewer before you read"
@@ -57,14 +56,19 @@ class Protocol(HttpToolsProtocol):
         self._framing_bytes = 0
 
     def on_body(self, body: bytes) -> None:
-        """Take a piece of the body, which is no framing."""
+        """Take a piece of the body, which is no framing; no body earns more than one more bound."""
         super().on_body(body)
         self._framing_bytes -= len(body) + len(body) // FRAMING_SHARE
+        self._framing_bytes = max(self._framing_bytes, -MAX_FRAMING_BYTES)
 
     def send_400_response(self, msg: str) -> None:
         """Answer in the shape of all errors, unless an answer has begun; close the connection."""
-        cycle = self.cycle
-        answering = cycle is not None and cycle.response_started and not cycle.response_complete
+        # Where requests wait, an earlier one than the last is being answered.
+        cycle, waiting = self.cycle, bool(self.pipeline)
+        self.pipeline.clear()
+        answering = waiting or (
+            cycle is not None and cycle.response_started and not cycle.response_complete
+        )
         if cycle is not None and not cycle.response_complete:
             cycle.disconnected = True
             cycle.message_event.set()

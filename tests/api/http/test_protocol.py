@@ -112,6 +112,15 @@ def test_requests_in_a_row_and_in_one_piece_are_answered(server: Server) -> None
             assert seen.count(b"HTTP/1.1 200 ") == 2
 
 
+def test_what_follows_a_refused_body_is_bounded(server: Server) -> None:
+    """The rest of the body is dropped, and earns no room for trailers."""
+    head = POST + b"Transfer-Encoding: chunked\r\n\r\n"
+    body = (b"10000\r\n" + b"x" * 0x10000 + b"\r\n") * 100
+    with connect(server) as raw:
+        seen = exchange(raw, head, body, b"0\r\n", *[b"a: b\r\n" * 1_000] * 100)
+    assert seen.startswith(b"HTTP/1.1 405 ")
+
+
 def test_a_flood_of_requests_on_one_connection_ends_it(server: Server) -> None:
     with connect(server) as raw:
         seen = exchange(raw, SMUGGLED * 4_000)
