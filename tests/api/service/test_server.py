@@ -4,6 +4,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -12,6 +13,8 @@ from pathlib import Path
 import httpx
 import pytest
 
+from api.http.errors import DatabaseAway
+from api.service.server import RETRY_S, open_patiently
 from tests.api.deployment import bearer, deploy, environment_of, images, photo
 from tests.api.server_process import Server
 from tests.api.shapes import assert_error
@@ -166,3 +169,18 @@ def test_stopping_finishes_what_runs_and_logs_only_json(server: Server) -> None:
     assert not any("HTTP/1.1" in event for event in events)
     assert not any(line.get("status", 0) >= 500 for line in lines)
     assert server.deployment.token not in server.log.read_text()
+
+
+def test_a_worker_waits_for_a_database_that_is_away(tmp_path: Path) -> None:
+    """Until it is told to stop; one that could not start would stop the workers beside it."""
+    deployment = deploy(tmp_path)
+    nobody = f"postgresql+psycopg://veilface@127.0.0.1:{free_port()}/veilface"
+    away = deployment.settings.model_copy(update={"database_url": nobody})
+    stopping = threading.Event()
+    with ThreadPoolExecutor(1) as pool:
+        opening = pool.submit(open_patiently, away, contract=deployment.contract, stopping=stopping)
+        with pytest.raises(TimeoutError):
+            opening.result(timeout=3 * RETRY_S)
+        stopping.set()
+        with pytest.raises(DatabaseAway):
+            opening.result(timeout=PATIENCE_S)
