@@ -102,6 +102,26 @@ def test_an_address_is_counted_by_what_one_client_has(host: str, counted: str) -
     assert address_of(host) == counted
 
 
+@pytest.mark.parametrize(
+    ("host", "counted"),
+    [("2001:db8:1:2::", "2001:db8:1::/48"), ("::ffff:192.0.2.7", "192.0.2.0/24"), ("", "unknown")],
+)
+def test_in_a_crowd_networks_are_counted(host: str, counted: str) -> None:
+    assert address_of(host, crowded=True) == counted
+
+
+def test_one_customer_with_many_networks_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rates, "CROWD", 100)
+
+    async def knock() -> None:
+        limits = RateLimits(key="off", address="50/minute")
+        for network in range(300):
+            await limits.count_address({"client": (f"2001:db8:1:{network:x}::", 1)})
+
+    with pytest.raises(ApiError, match="too many requests from this address"):
+        anyio.run(knock)
+
+
 def test_the_next_one_is_refused_and_told_how_long_to_wait(make: Make) -> None:
     async def scenario() -> None:
         async with make("3/2 second") as counted:
