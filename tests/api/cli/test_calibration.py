@@ -43,3 +43,11 @@ def test_of_faces_that_look_alike_the_first_stays() -> None:
     kept = without_lookalikes(Extraction(rows, paths, [], cached=0))
     assert [path.name for path in kept.paths] == ["0.jpg", "1.jpg", "3.jpg"]
     np.testing.assert_array_equal(kept.descriptors, rows[[0, 1, 3]])
+
+
+def test_copies_among_thousands_are_dropped() -> None:
+    rows = unit(np.random.default_rng(9).normal(size=(5_000, 128)))
+    rows[7], rows[4_999] = rows[3], rows[2_500]
+    paths = [Path(f"{number}.jpg") for number in range(len(rows))]
+    kept = without_lookalikes(Extraction(rows, paths, [], cached=0))
+    assert {int(path.stem) for path in kept.paths} == set(range(5_000)) - {7, 4_999}

@@ -81,7 +81,13 @@ def test_the_token_alone_is_on_stdout_or_in_a_private_file(veilface, store, tmp_
     assert store.api_keys.verify(file.read_text().strip()).prefix == kept.json["prefix"]
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
     assert file.read_text().strip() not in kept.stdout + kept.stderr
-    assert veilface(*create, "--out", file).status == 1
+    before = veilface("keys", "list", "--json").json
+    for out in (file, tmp_path / "absent" / "key"):
+        assert veilface(*create, "--out", out).status == 1
+        assert veilface("keys", "replace", kept.json["prefix"], "--out", out).status == 1
+    after = veilface("keys", "list", "--json").json
+    assert [key["prefix"] for key in after] == [key["prefix"] for key in before]
+    assert store.api_keys.verify(file.read_text().strip()) is not None
 
 
 def test_a_key_needs_rights_that_exist(veilface):
