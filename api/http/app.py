@@ -212,7 +212,7 @@ async def _open(
     runtime = await anyio.to_thread.run_sync(open_runtime, settings)
     running.push_async_callback(_close, runtime)
     gate = Gate(slots=settings.resolved_compute_slots, waiting=settings.queue_limit)
-    readiness = Readiness(runtime.store, runtime.pack, gate)
+    readiness = Readiness(runtime.store, runtime.pack, gate, runtime.keyring)
     app.state.rate_limits, app.state.runtime = rate_limits, runtime
     app.state.gate, app.state.readiness = gate, readiness
     forget_dead_workers()

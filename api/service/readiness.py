@@ -12,6 +12,7 @@ from api.service.opening import try_inference
 from models.errors import ModelError
 from models.pack import ModelPack
 from templates.errors import StoreBusy, StoreError
+from templates.keys.sealing import MasterKeyring
 from templates.store import TemplateStore
 from templates.store.tenants import RetiredRotation
 
@@ -29,10 +30,16 @@ class Readiness:
     ----------
     store, pack, gate
         What is asked, and what bounds the asking; no pack is nothing to ask.
+    keyring
+        The master keys, whose file may change, and then be one that cannot be read.
     """
 
-    def __init__(self, store: TemplateStore, pack: ModelPack | None, gate: Gate) -> None:
+    def __init__(
+        self, store: TemplateStore, pack: ModelPack | None, gate: Gate, keyring: MasterKeyring
+    ) -> None:
         self._store = store
+        self._keyring = keyring
+        self._stale = False
         self._pack = pack
         self._gate = gate
         self._failed: set[str] = set()
@@ -79,6 +86,14 @@ class Readiness:
             except Exception as error:
                 # Noted already. The next look must come: this task ends with the worker only.
                 log("check failed", severity=logging.DEBUG, error_type=type(error).__name__)
+            self._watch_keys()
+
+    def _watch_keys(self) -> None:
+        stale = self._keyring.stale_reason is not None
+        if stale and not self._stale:
+            # A rotation by another user, or a broken file: the old key goes on sealing.
+            log("the master keys changed and cannot be read", severity=logging.ERROR)
+        self._stale = stale
 
     def _infer(self) -> None:
         assert self._pack is not None  # noqa: S101 - no inference fails without a pack

@@ -152,6 +152,32 @@ def test_recovery_is_seen_without_anybody_asking(
     assert said == ["store failed", "store is available again"]
 
 
+def test_a_key_file_that_broke_is_logged_once(
+    deployment: Deployment, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(
+        "api.service.readiness.Readiness.watch.__kwdefaults__", {"every_s": 0.05}, raising=False
+    )
+    file = deployment.settings.resolved_master_key_file
+    kept = file.read_bytes()
+    logged = ""
+
+    def said() -> int:
+        nonlocal logged
+        logged += capfd.readouterr().err
+        return logged.count('"event": "the master keys changed and cannot be read"')
+
+    with Client(create_app(deployment.settings)) as client:
+        try:
+            file.write_bytes(b"")
+            wait_until(lambda: said() == 1, what="the line about the keys")
+            time.sleep(0.3)
+            assert said() == 1
+            assert client.get(READY).status_code == 200
+        finally:
+            file.write_bytes(kept)
+
+
 def _store_error() -> Exception:
     from templates.errors import StoreUnavailable
 
