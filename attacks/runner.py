@@ -32,7 +32,7 @@ from verify.metrics import rate
 
 MATCH_FMR = 1e-3
 """Of the raw comparison that decides whether a guess is a match."""
-STOLEN, KEPT = "", "holder's key kept"
+KEPT = "holder's key kept"
 WITH_KEY, WITHOUT_KEY = "with the key", "without the key"
 OPEN, ONE_SET = "keys leaked", "one set for both"
 CONTROL_DIM = 4
