@@ -71,7 +71,7 @@ class Quality:
 
 @dataclass(frozen=True, kw_only=True)
 class QualityLimits:
-    """What a face must reach. How the defaults were measured: docs/quality-gate.md.
+    """What a face must reach. How the defaults were measured: docs/results/photos.md.
 
     Attributes
     ----------

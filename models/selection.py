@@ -7,7 +7,7 @@ from models.boxes import Face
 from models.errors import MultipleFaces, NoFace
 
 # Least area of the face that is meant over that of every other face. Measured in
-# docs/quality-gate.md.
+# docs/results/photos.md.
 DOMINANCE = 2.0
 LARGER = 1.25
 
