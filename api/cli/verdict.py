@@ -53,7 +53,7 @@ def _accuracy_line(accuracy: Judgement | None) -> str:
     )
 
 
-# As measured: docs/thresholds.md "Children".
+# As measured: docs/results/children.md.
 _CHILDREN = "Of children below about ten years no level holds that was set on adults."
 
 
