@@ -3,11 +3,12 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
-from templates.contract.canonical import Json, digest, free_object
-from templates.contract.levels import SHA256_HEX
-from templates.contract.parsing import JsonValue
+from pydantic import Field
+
+from templates.contract.canonical import Json, digest, plain_json
+from templates.contract.parsing import JsonValue, Sha256
 from templates.errors import ContractError, ContractMismatch
 from templates.keys.rotation import ROTATION_VERSION
 from templates.space.lifting import Strategy
@@ -39,8 +40,7 @@ def embedding_id(*, embedder_sha256: str, preprocessing: Mapping[str, object]) -
     ContractError
         Where the preprocessing is not plain JSON.
     """
-    plain = free_object(preprocessing, what="the preprocessing")
-    return digest({"embedder_sha256": embedder_sha256, "preprocessing": plain})
+    return digest({"embedder_sha256": embedder_sha256, "preprocessing": preprocessing})
 
 
 @dataclass(frozen=True)
@@ -68,31 +68,21 @@ class Binding(JsonValue):
 
     what: ClassVar[str] = "the binding"
 
-    embedder_sha256: str
+    embedder_sha256: Sha256
     preprocessing: Mapping[str, Json]
-    n: int
-    axes: int
+    n: Annotated[int, Field(ge=2, le=MAX_N)]
+    axes: Annotated[int, Field(ge=2, le=MAX_N)]
     strategy: Strategy
-    m: int
-    decoy_source_id: str
+    m: Annotated[int, Field(ge=1, le=MAX_M)]
+    decoy_source_id: Sha256
     rotation_version: str
 
     def __post_init__(self) -> None:
-        if not SHA256_HEX.fullmatch(self.embedder_sha256):
-            raise ContractError("the embedder's hash must be 64 lower-case hexadecimal digits")
-        if not SHA256_HEX.fullmatch(self.decoy_source_id):
-            raise ContractError("the decoy source's id must be 64 lower-case hexadecimal digits")
-        if not 2 <= self.n <= MAX_N:
-            raise ContractError(f"the embedding dimension must lie in 2 to {MAX_N}")
-        if not 2 <= self.axes <= self.n:
-            raise ContractError("the number of axes must lie in 2 to the embedding dimension")
-        if not 1 <= self.m <= min(MAX_M, self.axes - 1):
-            raise ContractError(f"the subspace dimension must lie in 1 to min({MAX_M}, axes - 1)")
+        if not self.m < self.axes <= self.n:
+            raise ContractError(f"m < axes <= n is needed: {self.m}, {self.axes}, {self.n}")
         if self.rotation_version != ROTATION_VERSION:
             raise ContractError(f"this program turns templates by {ROTATION_VERSION!r} only")
-        preprocessing = free_object(self.preprocessing, what="the preprocessing")
-        object.__setattr__(self, "preprocessing", preprocessing)
-        object.__setattr__(self, "strategy", Strategy(self.strategy))
+        object.__setattr__(self, "preprocessing", plain_json(self.preprocessing))
 
     @cached_property
     def contract_id(self) -> str:
@@ -124,7 +114,7 @@ class Binding(JsonValue):
                 f"the contract is bound to embedder {self.embedder_sha256[:16]}…, the pack's is "
                 f"{embedder_sha256[:16]}…; use the pack that the contract was calibrated with"
             )
-        of_pack = free_object(preprocessing, what="the pack's preprocessing")
+        of_pack = {name: plain_json(value) for name, value in preprocessing.items()}
         if of_pack != self.preprocessing:
             keys = sorted(of_pack.keys() | self.preprocessing.keys())
             differing = [key for key in keys if of_pack.get(key) != self.preprocessing.get(key)]

@@ -8,7 +8,7 @@ as integers (as RFC 8785 does), so that ``127`` and ``127.0`` bind the same prep
 import hashlib
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 from pydantic import JsonValue
 
@@ -16,75 +16,41 @@ from templates.errors import ContractError
 
 Json = JsonValue
 
-MAX_DEPTH = 12
-FREE_DEPTH = 4  # of an object of free content, which sits some levels down in its document
-MAX_ITEMS = 4096
-MAX_STRING = 4096
 MAX_PARTS = 100_000
 """Values in a document, counted before it is parsed: a parsed value takes up to a hundred times
 the bytes of its text."""
 
 
-def plain_json(value: object, *, depth: int = MAX_DEPTH) -> Json:
-    """Copy ``value`` as plain JSON values, bounded in depth, length and string size.
+def plain_json(value: object) -> Json:
+    """Copy ``value`` as plain JSON values, which equal themselves after a round trip.
 
-    Tuples become lists and integral floats become integers, so that a value equals itself after
-    a round trip through a file.
+    Tuples become lists, and integral floats become integers.
 
     Raises
     ------
     ContractError
-        Where the value is not JSON, not finite, or beyond the bounds.
+        Where the value is not JSON, or a number is not finite.
     """
-    if depth < 0:
-        raise ContractError("a value is nested too deep")
-    if value is None or isinstance(value, bool):
-        return value
-    if isinstance(value, str):
-        if len(value) > MAX_STRING:
-            raise ContractError(f"a text is longer than {MAX_STRING} characters")
-        return str(value)
-    if isinstance(value, int):
-        if abs(value) > 2**53:
-            raise ContractError("an integer is beyond 2^53, which JSON readers do not keep exactly")
-        return int(value)
-    if isinstance(value, float):
-        if not math.isfinite(value):
-            raise ContractError("a number is not finite")
-        if value.is_integer() and abs(value) <= 2**53:
-            return int(value)
-        return float(value)
-    if isinstance(value, Mapping):
-        if len(value) > MAX_ITEMS:
-            raise ContractError(f"an object has more than {MAX_ITEMS} entries")
-        if not all(isinstance(key, str) and len(key) <= MAX_STRING for key in value):
-            raise ContractError("an object has a key that is not a short text")
-        return {str(key): plain_json(entry, depth=depth - 1) for key, entry in value.items()}
-    if isinstance(value, Sequence) and not isinstance(value, bytes | bytearray):
-        if len(value) > MAX_ITEMS:
-            raise ContractError(f"a list has more than {MAX_ITEMS} entries")
-        return [plain_json(entry, depth=depth - 1) for entry in value]
-    raise ContractError(f"a value of type {type(value).__name__} cannot be written as JSON")
-
-
-def free_object(value: object, *, what: str) -> dict[str, Json]:
-    """Copy an object of free content, at most ``FREE_DEPTH`` levels deep."""
-    plain = plain_json(value, depth=FREE_DEPTH)
-    if not isinstance(plain, dict):
-        raise ContractError(f"{what} is not a JSON object")
-    return plain
+    match value:
+        case None | bool() | str() | int():
+            return value
+        case float() if math.isfinite(value):
+            return int(value) if value.is_integer() else value
+        case Mapping() if all(isinstance(key, str) for key in value):
+            return {key: plain_json(entry) for key, entry in value.items()}
+        case list() | tuple():
+            return [plain_json(entry) for entry in value]
+    raise ContractError(f"a {type(value).__name__} cannot be written as JSON, or is not finite")
 
 
 def canonical_json(value: object) -> bytes:
     """Bytes under every hash: sorted keys, no spaces, UTF-8, finite numbers."""
-    plain = plain_json(value)
     try:
-        text = json.dumps(
-            plain, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False
-        )
+        plain = plain_json(value)
+        text = json.dumps(plain, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
         return text.encode("utf-8")
-    except UnicodeEncodeError:
-        raise ContractError("a text holds a lone surrogate, which UTF-8 cannot carry") from None
+    except (UnicodeEncodeError, RecursionError):
+        raise ContractError("a text is no Unicode, or a value is nested too deep") from None
 
 
 def digest(value: object) -> str:

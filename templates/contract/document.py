@@ -12,25 +12,19 @@ holds the digest of everything else in the file, so that an edited threshold is 
 import base64
 import binascii
 import json
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import ClassVar
+from typing import Annotated, ClassVar
+
+from pydantic import Field
 
 from templates.contract.binding import Binding
-from templates.contract.canonical import Json, digest, free_object, parse_object
-from templates.contract.levels import (
-    LEVEL_NAME,
-    Calibration,
-    Level,
-    Mode,
-    Rate,
-    check_norm_range,
-)
+from templates.contract.canonical import Json, digest, parse_object
+from templates.contract.levels import Calibration, Level, LevelName, Mode, Rate
 from templates.contract.liveness import LivenessCalibration
 from templates.contract.nobody import Nobody
-from templates.contract.parsing import JsonValue
+from templates.contract.parsing import Cosine, JsonValue, Share
 from templates.contract.verdict import Verdict
 from templates.decoys import DecoySource, client_source
 from templates.distances import Metric
@@ -66,8 +60,7 @@ class Contract(JsonValue):
     recorded
         Facts that are recorded but not bound: pack name, detector and its input size, dates.
     calibrations
-        One per (mode, metric, probe m, probe photos); ids are computed here where they are empty,
-        and checked where they are not.
+        One per (mode, metric, probe m, probe photos); their ids are computed here.
     default_level
         Level of a request that names none.
     photo_consistency, probe_consistency
@@ -94,52 +87,31 @@ class Contract(JsonValue):
 
     binding: Binding
     recorded: Mapping[str, Json]
-    calibrations: tuple[Calibration, ...]
-    default_level: str
-    photo_consistency: float
-    probe_consistency: float
-    template_foot_point_norm: tuple[float, float]
+    calibrations: Annotated[tuple[Calibration, ...], Field(max_length=MAX_CALIBRATIONS)]
+    default_level: LevelName
+    photo_consistency: Cosine
+    probe_consistency: Cosine
+    template_foot_point_norm: tuple[Share, Share]
     template_stranger_similarity: float
-    cohort_seed: bytes = field(repr=False)
+    cohort_seed: Annotated[bytes, Field(min_length=KEY_BYTES, max_length=KEY_BYTES)] = field(
+        repr=False
+    )
     verdict: Verdict | None = None
     liveness: LivenessCalibration | None = None
 
     def __post_init__(self) -> None:
-        recorded = free_object(self.recorded, what="the record")
-        object.__setattr__(self, "recorded", recorded)
-        for name in ("photo_consistency", "probe_consistency"):
-            if not -1.0 <= getattr(self, name) <= 1.0:
-                raise ContractError(f"{name} is a cosine and must lie in [-1, 1]")
-        if not LEVEL_NAME.fullmatch(self.default_level):
-            raise ContractError("the default level's name must match " + LEVEL_NAME.pattern)
-        check_norm_range(self.template_foot_point_norm)
-        if not math.isfinite(self.template_stranger_similarity):
-            raise ContractError("template_stranger_similarity is not a finite number")
-        if len(self.cohort_seed) != KEY_BYTES:
-            raise ContractError(f"the cohort's seed must have {KEY_BYTES} bytes")
-        self._check_calibrations()
-
-    def _check_calibrations(self) -> None:
-        if not 1 <= len(self.calibrations) <= MAX_CALIBRATIONS:
-            raise ContractError(f"a contract needs 1 to {MAX_CALIBRATIONS} calibrations")
         keys = {
             (entry.mode, entry.metric, entry.probe_m, entry.probe_photos)
             for entry in self.calibrations
         }
         if len(keys) != len(self.calibrations):
             raise ContractError("two calibrations share mode, metric, probe m and probe photos")
-        points = {entry.metric for entry in self.calibrations if entry.mode == "p2s"}
-        if len(points) > 1:
+        if len({entry.metric for entry in self.calibrations if entry.mode == "p2s"}) > 1:
             raise ContractError("points are decided by one metric")
-        if any(entry.probe_m >= self.binding.axes for entry in self.calibrations):
-            raise ContractError("a calibration's probe m is not below the number of axes")
-        names = {level.name for entry in self.calibrations for level in entry.levels}
-        if self.default_level not in names:
+        levels = {level.name for entry in self.calibrations for level in entry.levels}
+        if self.default_level not in levels:
             raise ContractError("no calibration has the default level")
         identified = tuple(entry.identified(self.contract_id) for entry in self.calibrations)
-        for given, computed in zip(self.calibrations, identified, strict=True):
-            if given.calibration_id not in ("", computed.calibration_id):
-                raise ContractError("a calibration_id is not the hash of its calibration")
         object.__setattr__(self, "calibrations", identified)
 
     @property
@@ -237,7 +209,13 @@ class Contract(JsonValue):
         """Write the contract file atomically, readable by its owner only (mode 0600).
 
         ``public()`` returns the same facts for readers who may not know the seed.
+
+        Raises
+        ------
+        ContractError
+            Where :meth:`load` would refuse the file.
         """
+        self.from_json(self.to_json(), cohort_seed=self.cohort_seed.hex())
         document: dict[str, Json] = {"format": FORMAT, "version": VERSION, **self.public()}
         sealed = sealer.seal(self.cohort_seed, context=_seal_context(document))
         document["sealed"] = base64.b64encode(sealed).decode("ascii")
@@ -245,7 +223,7 @@ class Contract(JsonValue):
 
     @classmethod
     def load(cls, path: Path | str, sealer: Sealer) -> "Contract":
-        """Read a contract file, treating it as hostile.
+        """Read a contract file: its seal is opened first, so what is parsed is what was sealed.
 
         Raises
         ------

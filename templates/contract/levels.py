@@ -1,15 +1,14 @@
 """What a calibration found: rates with their counts, levels, and the calibration itself."""
 
-import math
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Annotated, ClassVar, Literal, TypeAlias, get_args
+from typing import Annotated, ClassVar, Literal, TypeAlias
 
 from pydantic import Field
 
-from templates.contract.canonical import Json, digest, free_object
-from templates.contract.parsing import JsonValue
+from templates.contract.canonical import Json, digest
+from templates.contract.parsing import JsonValue, Share
 from templates.distances import Metric
 from templates.errors import ContractError, Uncalibrated
 
@@ -24,7 +23,11 @@ MAX_GROUPS = 64
 """Groups of people in a level, over all attributes."""
 MAX_GROUP_NAME = 100
 LEVEL_NAME = re.compile(r"[a-z0-9][a-z0-9.+-]{0,31}")
-SHA256_HEX = re.compile(r"[0-9a-f]{64}")
+
+Count = Annotated[int, Field(ge=0)]
+LevelName = Annotated[str, Field(pattern=f"^{LEVEL_NAME.pattern}$")]
+Photos = Annotated[int, Field(ge=1, le=MAX_PHOTOS)]
+GroupName = Annotated[str, Field(min_length=1, max_length=MAX_GROUP_NAME)]
 
 
 def photos_in_words(count: int) -> str:
@@ -49,19 +52,11 @@ class Rate(JsonValue):
 
     what: ClassVar[str] = "a rate"
 
-    errors: int
-    trials: int
-    ci_low: float
-    ci_high: float
+    errors: Count
+    trials: Count
+    ci_low: Share
+    ci_high: Share
     interval: Interval = "wilson"
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.errors <= self.trials:
-            raise ContractError("a rate needs 0 <= errors <= trials")
-        if not 0.0 <= self.ci_low <= self.ci_high <= 1.0:
-            raise ContractError("a rate's interval must be ordered and inside [0, 1]")
-        if self.interval not in get_args(Interval):
-            raise ContractError(f"a rate's interval must be one of {get_args(Interval)}")
 
     @property
     def value(self) -> float:
@@ -88,15 +83,12 @@ class GroupRates(JsonValue):
 
     what: ClassVar[str] = "the rates of a group"
 
-    attribute: str
-    group: str
+    attribute: GroupName
+    group: GroupName
     fmr: Rate
     frr: Rate
     fmr_judged: bool
     frr_judged: bool
-
-    def __post_init__(self) -> None:
-        check_group_names((self.attribute, self.group))
 
 
 def check_group_names(names: Iterable[str]) -> None:
@@ -138,28 +130,14 @@ class Level(JsonValue):
 
     what: ClassVar[str] = "a level"
 
-    name: str
-    target_fmr: float | None
+    name: LevelName
+    target_fmr: Annotated[float, Field(gt=0, le=0.5)] | None
     threshold: Annotated[float, Field(alias="score_threshold")]
     fmr: Rate
     fnmr: Rate
-    fnmr_by_photos: Mapping[int, Rate] = field(default_factory=dict)
-    frr_by_photos: Mapping[int, Rate] = field(default_factory=dict)
-    groups: tuple[GroupRates, ...] = ()
-
-    def __post_init__(self) -> None:
-        if not LEVEL_NAME.fullmatch(self.name):
-            raise ContractError("a level's name must match " + LEVEL_NAME.pattern)
-        if self.target_fmr is not None and not 0.0 < self.target_fmr <= 0.5:
-            raise ContractError("a level's target FMR must lie in (0, 0.5]")
-        if not math.isfinite(self.threshold):
-            raise ContractError("a level's threshold is not a finite number")
-        enrolled = {*self.fnmr_by_photos, *self.frr_by_photos}
-        if not all(1 <= photos <= MAX_PHOTOS for photos in enrolled):
-            raise ContractError(f"a template is made of 1 to {MAX_PHOTOS} photos")
-        named = {(entry.attribute, entry.group) for entry in self.groups}
-        if len(self.groups) > MAX_GROUPS or len(named) != len(self.groups):
-            raise ContractError(f"a level has at most {MAX_GROUPS} groups, each of them once")
+    fnmr_by_photos: Mapping[Photos, Rate] = field(default_factory=dict)
+    frr_by_photos: Mapping[Photos, Rate] = field(default_factory=dict)
+    groups: Annotated[tuple[GroupRates, ...], Field(max_length=MAX_GROUPS)] = ()
 
     def to_json(self) -> dict[str, Json]:
         """JSON form; without ``frr_by_photos`` and ``groups`` where they are empty."""
@@ -201,40 +179,13 @@ class Calibration(JsonValue):
 
     mode: Mode
     metric: Metric
-    probe_m: int
-    steps: int
-    levels: tuple[Level, ...]
-    foot_point_norm: tuple[float, float] | None
+    probe_m: Annotated[int, Field(ge=0, le=4096)]
+    steps: Annotated[int, Field(ge=1, le=MAX_STEPS)]
+    levels: Annotated[tuple[Level, ...], Field(min_length=1, max_length=MAX_LEVELS)]
+    foot_point_norm: tuple[Share, Share] | None
     calibrated_on: Mapping[str, Json] = field(default_factory=dict)
-    probe_photos: int = 1
+    probe_photos: Annotated[int, Field(ge=1, le=MAX_PROBE_PHOTOS)] = 1
     calibration_id: str = ""
-
-    def __post_init__(self) -> None:
-        if self.mode not in get_args(Mode):
-            raise ContractError("a calibration's mode must be p2s or s2s")
-        if (self.mode == "p2s") != (self.probe_m == 0) or not 0 <= self.probe_m <= 4096:
-            raise ContractError("a calibration's probe m must be 0 in p2s and 1 or more in s2s")
-        if not 1 <= self.probe_photos <= (MAX_PROBE_PHOTOS if self.mode == "p2s" else 1):
-            raise ContractError(
-                f"a probe is of 1 to {MAX_PROBE_PHOTOS} photos in p2s, and of 1 in s2s"
-            )
-        if (self.mode == "p2s") != (self.foot_point_norm is None):
-            raise ContractError("a calibration has a range of foot-point norms exactly in s2s")
-        if self.foot_point_norm is not None:
-            check_norm_range(self.foot_point_norm)
-        if not 1 <= self.steps <= MAX_STEPS:
-            raise ContractError(f"a calibration's steps must lie in 1 to {MAX_STEPS}")
-        names = [level.name for level in self.levels]
-        if not names or len(names) > MAX_LEVELS or len(set(names)) != len(names):
-            raise ContractError(f"a calibration needs 1 to {MAX_LEVELS} levels of distinct names")
-        # At most five calibrations are of raw probes, which bounds the values in a contract.
-        if self.mode == "s2s" and any(level.groups for level in self.levels):
-            raise ContractError("rates by group are of raw probes")
-        if self.probe_photos == 1 and any(level.frr_by_photos for level in self.levels):
-            raise ContractError("one photo cannot disagree: its FRR is its FNMR")
-        facts = free_object(self.calibrated_on, what="what a calibration was calibrated on")
-        object.__setattr__(self, "calibrated_on", facts)
-        object.__setattr__(self, "metric", Metric(self.metric))
 
     def level(self, name: str) -> Level:
         """Find a level by name.
@@ -262,10 +213,3 @@ class Calibration(JsonValue):
         del body["calibration_id"]
         bound: dict[str, Json] = {"calibration": body, "contract_id": contract_id}
         return replace(self, calibration_id=digest(bound))
-
-
-def check_norm_range(norms: tuple[float, float]) -> None:
-    """Refuse a range that is not ordered inside [0, 1]."""
-    low, high = norms
-    if not 0.0 <= low < high <= 1.0:
-        raise ContractError("a range of foot-point norms must be ordered and inside [0, 1]")

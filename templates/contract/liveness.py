@@ -4,20 +4,20 @@ It is no part of the ``contract_id``: another threshold, or other liveness graph
 templates as they are.
 """
 
-import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
-from templates.contract.canonical import Json, free_object
-from templates.contract.levels import SHA256_HEX, Rate
-from templates.contract.parsing import JsonValue
-from templates.errors import ContractError, Uncalibrated
+from pydantic import Field
 
-MAX_LIVENESS_GRAPHS = 8
-MAX_SPECIES = 64
+from templates.contract.canonical import Json
+from templates.contract.levels import Rate
+from templates.contract.parsing import JsonValue, Sha256
+from templates.errors import Uncalibrated
+
 SPECIES_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._+-]{0,63}")
+Species = Annotated[str, Field(pattern=f"^{SPECIES_NAME.pattern}$")]
 
 
 @dataclass(frozen=True)
@@ -45,34 +45,14 @@ class LivenessCalibration(JsonValue):
 
     what: ClassVar[str] = "the liveness calibration"
 
-    graphs: tuple[str, ...]
+    graphs: Annotated[tuple[Sha256, ...], Field(min_length=1)]
     threshold: float
     bpcer: Rate
-    target_bpcer: float
-    apcer: Mapping[str, Rate] = field(default_factory=dict)
+    target_bpcer: Annotated[float, Field(gt=0, lt=1)]
+    apcer: Mapping[Annotated[str, Field(pattern=f"^{SPECIES_NAME.pattern}$")], Rate] = field(
+        default_factory=dict
+    )
     calibrated_on: Mapping[str, Json] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        if not 1 <= len(self.graphs) <= MAX_LIVENESS_GRAPHS:
-            raise ContractError(f"a liveness threshold is of 1 to {MAX_LIVENESS_GRAPHS} graphs")
-        if not all(SHA256_HEX.fullmatch(graph) for graph in self.graphs):
-            raise ContractError("the id of a liveness graph is not a SHA-256")
-        if list(self.graphs) != sorted(set(self.graphs)):
-            raise ContractError("the liveness graphs are not sorted, or one is named twice")
-        if not math.isfinite(self.threshold):
-            raise ContractError("the liveness threshold is not a finite number")
-        if not 0.0 < self.target_bpcer < 1.0:
-            raise ContractError("the target BPCER must lie between 0 and 1")
-        if not self.bpcer.trials:
-            raise ContractError("a liveness threshold needs live photos")
-        if len(self.apcer) > MAX_SPECIES or not all(map(SPECIES_NAME.fullmatch, self.apcer)):
-            raise ContractError(
-                f"attack species are at most {MAX_SPECIES}, with names that match "
-                f"{SPECIES_NAME.pattern}"
-            )
-        object.__setattr__(self, "apcer", dict(sorted(self.apcer.items())))
-        stated = free_object(self.calibrated_on, what="what liveness was calibrated on")
-        object.__setattr__(self, "calibrated_on", stated)
 
     @property
     def worst_species(self) -> str | None:

@@ -1,20 +1,27 @@
-"""Values of a contract as JSON, and read from JSON that is treated as hostile.
+"""Values of a contract as JSON, and read from JSON.
 
-pydantic checks every type, strictly: ``"1"`` and ``true`` are no integers, and nothing is NaN. Then
-the value that was read is written again, and has to be what was given. So a key that nobody knows,
-one that is missing, and one that contradicts the others are all refused, by one rule.
+pydantic checks every type and range, strictly: ``"1"`` and ``true`` are no integers, and nothing is
+NaN. Then the value that was read is written again, and has to be what was given. So a key that
+nobody knows, one that is missing, and one that contradicts the others are all refused, by one rule.
+
+The checks are made where a value is read, and before a contract is written. A value that our own
+code makes is not checked again.
 """
 
 import dataclasses
 from collections.abc import Mapping
 from enum import Enum
 from functools import cache
-from typing import Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self
 
-from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
-from templates.contract.canonical import MAX_STRING, Json, canonical_json, plain_json
+from templates.contract.canonical import Json, canonical_json, plain_json
 from templates.errors import ContractError
+
+Share = Annotated[float, Field(ge=0, le=1)]
+Cosine = Annotated[float, Field(ge=-1, le=1)]
+Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 
 
 class JsonValue:
@@ -25,7 +32,7 @@ class JsonValue:
 
     what: ClassVar[str]
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(
-        strict=True, allow_inf_nan=False, str_max_length=MAX_STRING, val_json_bytes="hex"
+        strict=True, allow_inf_nan=False, val_json_bytes="hex"
     )
 
     def to_json(self) -> dict[str, Json]:
@@ -35,7 +42,7 @@ class JsonValue:
 
     @classmethod
     def from_json(cls, value: object, **unwritten: str) -> Self:
-        """Read hostile JSON, and fields that the JSON form leaves out: bytes, in hexadecimal.
+        """Read JSON, and fields that the JSON form leaves out: bytes, in hexadecimal.
 
         Raises
         ------

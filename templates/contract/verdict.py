@@ -3,20 +3,20 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal, TypeAlias
+from typing import Annotated, ClassVar, Literal, TypeAlias
 
 import numpy as np
+from pydantic import Field
 
-from templates.contract.canonical import Json, free_object
+from templates.contract.canonical import Json
 from templates.contract.levels import Rate
 from templates.contract.parsing import JsonValue
-from templates.errors import ContractError
 
 Status: TypeAlias = Literal["PASS", "FAIL", "NOT SHOWN"]
 CONFIDENCE = 0.95
 _BISECTIONS = 50
-_MOST_TRIALS = 10_000
-"""Of a rate that a bound is held against: people who were attacked."""
+
+Limit = Annotated[float, Field(gt=0, lt=1)]
 
 
 def upper_bound(errors: int, trials: int, *, confidence: float = CONFIDENCE) -> float:
@@ -60,21 +60,10 @@ class Judgement(JsonValue):
     what: ClassVar[str] = "a verdict"
 
     rate: Rate
-    limit: float
+    limit: Limit
     basis: Mapping[str, Json] = field(default_factory=dict)
     shortfall: str | None = None
-    bound: float | None = None
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.limit < 1.0:
-            raise ContractError("the limit of a verdict must lie between 0 and 1")
-        if self.bound is not None and not self.limit <= self.bound < 1.0:
-            raise ContractError("the bound of a verdict must lie between its limit and 1")
-        if self.bound is not None and self.rate.trials > _MOST_TRIALS:
-            raise ContractError(f"a verdict with a bound counts at most {_MOST_TRIALS:,} trials")
-        if not self.rate.trials:
-            raise ContractError("a verdict without a trial says nothing")
-        object.__setattr__(self, "basis", free_object(self.basis, what="the basis of a verdict"))
+    bound: Limit | None = None
 
     @property
     def upper(self) -> float | None:

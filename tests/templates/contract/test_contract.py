@@ -1,4 +1,4 @@
-"""The contract: ids, the file, and everything that must not pass as a file."""
+"""The contract: ids, its file, and everything that must not pass as a file."""
 
 import base64
 import dataclasses
@@ -17,16 +17,17 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from templates.contract import document as contract_module
-from templates.contract.canonical import MAX_ITEMS, MAX_PARTS, canonical_json, too_many_parts
+from templates.contract.canonical import MAX_PARTS, canonical_json
 from templates.contract.document import (
-    MAX_CALIBRATIONS,
     Binding,
     Calibration,
     Contract,
     Level,
+    LivenessCalibration,
     Rate,
 )
-from templates.contract.levels import MAX_LEVELS
+from templates.contract.levels import GroupRates
+from templates.contract.verdict import Judgement, Verdict
 from templates.decoys import DecoyGenerator
 from templates.distances import Metric
 from templates.errors import ContractError, ContractMismatch, SealError, Uncalibrated
@@ -37,6 +38,21 @@ from templates.space.lifting import Strategy
 N, M = 16, 3
 SEALER = KeyringSealer(MasterKeyring([os.urandom(32)]))
 RATE = Rate(errors=2, trials=1000, ci_low=0.0005, ci_high=0.007)
+GRAPHS = ("0a" * 32, "1b" * 32)
+GROUP = GroupRates("gender", "Female", RATE, RATE, True, False)
+VERDICT = Verdict(
+    privacy=Judgement(RATE, 0.05, {"attack": "second moments"}, bound=0.1),
+    accuracy=Judgement(RATE, 0.02, {"level": "fmr-1e-4"}, shortfall="few"),
+    groups=Judgement(RATE, 0.02),
+)
+LIVENESS = LivenessCalibration(
+    graphs=GRAPHS,
+    threshold=0.75,
+    bpcer=RATE,
+    target_bpcer=0.05,
+    apcer={"print": RATE, "screen": Rate(9, 100, 0.05, 0.16)},
+    calibrated_on={"dataset": "booth", "subjects": None},
+)
 
 
 def make_binding(**changes: Any) -> Binding:
@@ -67,7 +83,7 @@ def make_calibration(**changes: Any) -> Calibration:
         "probe_m": 0,
         "steps": 50,
         "levels": (
-            Level("fmr-1e-2", 1e-2, 2.0, RATE, RATE, {1: RATE, 3: RATE}),
+            Level("fmr-1e-2", 1e-2, 2.0, RATE, RATE, {1: RATE, 3: RATE}, {3: RATE}, (GROUP,)),
             Level("accuracy", None, 3.0, RATE, RATE),
         ),
         "foot_point_norm": None,
@@ -90,6 +106,8 @@ def make_contract(**changes: Any) -> Contract:
         "template_foot_point_norm": (0.1, 0.8),
         "template_stranger_similarity": 0.7,
         "cohort_seed": bytes(range(32)),
+        "verdict": VERDICT,
+        "liveness": LIVENESS,
     }
     return Contract(**{**fields, **changes})
 
@@ -108,12 +126,9 @@ def test_contract_id_is_the_hash_of_the_canonical_json() -> None:
         '"rotation_version":"signs-cosine-2","strategy":"random"}'
     )
     assert make_binding().contract_id == hashlib.sha256(written.encode("utf-8")).hexdigest()
-
-
-def test_contract_id_depends_on_values_not_on_how_they_are_written() -> None:
+    # However the values are written.
     preprocessing = {"mean": [127.5] * 3, "flip": False, "size": 112.0}
     assert make_binding(preprocessing=preprocessing) == make_binding()
-    assert make_binding(preprocessing=preprocessing).contract_id == make_binding().contract_id
 
 
 @pytest.mark.parametrize(
@@ -136,25 +151,35 @@ def test_every_part_of_the_binding_changes_the_id(changes: dict[str, Any]) -> No
 def test_recalibrating_keeps_the_contract_id_and_changes_the_calibration_id() -> None:
     first = make_contract()
     levels = (Level("fmr-1e-2", 1e-2, 2.1, RATE, RATE),)
-    again = make_contract(calibrations=(make_calibration(levels=levels),))
-    ids = {entry.calibrations[0].calibration_id for entry in (first, again)}
-    assert len(ids) == 2
-    assert len({entry.contract_id for entry in (first, again)}) == 1
-    assert make_contract().calibrations[0].calibration_id in ids
+    again = make_contract(calibrations=(make_calibration(levels=levels),), liveness=None)
+    assert first.calibrations[0].calibration_id != again.calibrations[0].calibration_id
+    assert first.contract_id == again.contract_id
+    assert make_contract(verdict=None).calibrations == first.calibrations
 
 
 def test_canonical_json_agrees_with_sorted_compact_json() -> None:
     value = {"é": [1, 2.5, True, None], "a": {"z": "\n", "b": -0.125}}
     expected = json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
     assert canonical_json(value) == expected.encode("utf-8")
-    for broken in (float("nan"), float("inf"), "\ud800", object(), 2**60, b"x", {1: 2}):
+    deep: Any = 0
+    for _ in range(100_000):
+        deep = [deep]
+    for broken in (float("nan"), float("inf"), "\ud800", object(), b"x", {1: 2}, deep):
         with pytest.raises(ContractError):
             canonical_json({"x": broken})
-    deep: Any = 0
-    for _ in range(50):
-        deep = [deep]
-    with pytest.raises(ContractError, match="too deep"):
-        canonical_json(deep)
+
+
+def test_the_embedding_id_names_the_weights_and_the_preprocessing() -> None:
+    binding = make_binding()
+    text = json.dumps(
+        {"embedder_sha256": "ab" * 32, "preprocessing": dict(binding.preprocessing)},
+        sort_keys=True,
+        separators=(",", ":"),
+    )
+    assert binding.embedding_id == hashlib.sha256(text.encode()).hexdigest()
+    assert make_binding(m=2).embedding_id == binding.embedding_id
+    assert make_binding(preprocessing={"flip": 1}).embedding_id != binding.embedding_id
+    assert make_binding(embedder_sha256="ef" * 32).embedding_id != binding.embedding_id
 
 
 # --- values --------------------------------------------------------------------------------
@@ -163,67 +188,46 @@ def test_canonical_json_agrees_with_sorted_compact_json() -> None:
 @pytest.mark.parametrize(
     "changes",
     [
-        {"embedder_sha256": "AB" * 32},
-        {"decoy_source_id": "cd"},
-        {"n": 1},
-        {"n": 5000},
-        {"m": 0},
-        {"m": N},
-        {"rotation_version": ""},
-        {"preprocessing": {"mean": float("nan")}},
-    ],
-)
-def test_impossible_bindings_are_refused(changes: dict[str, Any]) -> None:
-    with pytest.raises(ContractError):
-        make_binding(**changes)
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"mode": "s2s"},
-        {"probe_m": 2},
-        {"foot_point_norm": (0.1, 0.2)},
-        {**LIFTED, "foot_point_norm": (0.9, 0.2)},
-        {"steps": 0},
-        {"levels": ()},
-        {"levels": (Level("a", 1e-2, 0, RATE, RATE),) * 2},
-        {"mode": "raw"},
-        {"probe_photos": 0},
-        {"probe_photos": 6},
-        {**LIFTED, "probe_photos": 2},
-    ],
-)
-def test_impossible_calibrations_are_refused(changes: dict[str, Any]) -> None:
-    with pytest.raises(ContractError):
-        make_calibration(**changes)
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [
         {"photo_consistency": 1.5},
-        {"probe_consistency": -1.5},
-        {"template_foot_point_norm": (0.8, 0.1)},
+        {"template_foot_point_norm": (0.1, 1.5)},
         {"template_stranger_similarity": float("nan")},
         {"cohort_seed": b"short"},
-        {"default_level": "fmr-1e-9"},
-        {"calibrations": ()},
-        {"calibrations": (make_calibration(), make_calibration(steps=9))},
-        {"calibrations": (make_calibration(calibration_id="0" * 64),)},
-        {"calibrations": (make_calibration(), make_calibration(metric=Metric.EUCLIDEAN))},
-        {"calibrations": (make_calibration(**LIFTED | {"probe_m": N - 2}),)},
+        {"calibrations": (make_calibration(steps=0),)},
+        {"calibrations": (make_calibration(foot_point_norm=(-0.1, 0.2)),)},
+        {"calibrations": (make_calibration(probe_photos=6),)},
+        {"calibrations": (make_calibration(levels=(Level("fmr-1e-2", 2.0, 0, RATE, RATE),)),)},
+        {"liveness": dataclasses.replace(LIVENESS, graphs=("0A" * 32,))},
+        {"liveness": dataclasses.replace(LIVENESS, apcer={"a/b": RATE})},
+        {"verdict": Verdict(Judgement(RATE, 1.0))},
     ],
 )
-def test_contradictions_are_refused(changes: dict[str, Any]) -> None:
+def test_what_could_not_be_read_is_not_written(tmp_path: Path, changes: dict[str, Any]) -> None:
     with pytest.raises(ContractError):
+        make_contract(**changes).save(tmp_path / "contract.json", SEALER)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"default_level": "fmr-1e-9"}, "default level"),
+        ({"calibrations": ()}, "default level"),
+        ({"calibrations": (make_calibration(), make_calibration(steps=9))}, "share mode"),
+        (
+            {"calibrations": (make_calibration(), make_calibration(metric=Metric.EUCLIDEAN))},
+            "one metric",
+        ),
+    ],
+)
+def test_contradictions_are_refused(changes: dict[str, Any], reason: str) -> None:
+    with pytest.raises(ContractError, match=reason):
         make_contract(**changes)
 
 
-@pytest.mark.parametrize("counts", [(3, 2, 0.0, 1.0), (-1, 2, 0.0, 1.0), (1, 2, 0.7, 0.2)])
-def test_impossible_rates_are_refused(counts: tuple[int, int, float, float]) -> None:
+@pytest.mark.parametrize("changes", [{"m": N - 2}, {"axes": N + 1}, {"rotation_version": ""}])
+def test_impossible_bindings_are_refused(changes: dict[str, Any]) -> None:
     with pytest.raises(ContractError):
-        Rate(*counts)
+        make_binding(**changes)
 
 
 def test_calibrations_are_found_or_the_choice_is_named() -> None:
@@ -239,6 +243,28 @@ def test_calibrations_are_found_or_the_choice_is_named() -> None:
         contract.calibration("p2s").level("fmr-1e-3")
 
 
+def test_the_calibration_of_the_most_photos_that_are_not_more_serves() -> None:
+    lax, strict = make_calibration().levels[0], Level("fmr-1e-4", 1e-4, 4.0, RATE, RATE)
+    contract = make_contract(
+        calibrations=(
+            make_calibration(levels=(lax, strict)),
+            make_calibration(levels=(lax, strict), probe_photos=2),
+            make_calibration(levels=(lax,), probe_photos=5),
+            make_calibration(**LIFTED),
+        )
+    )
+    chosen = [
+        contract.calibration("p2s", probe_photos=photos).probe_photos for photos in range(1, 9)
+    ]
+    assert chosen == [1, 2, 2, 2, 5, 5, 5, 5]
+    # A level that more photos do not resolve is taken from fewer.
+    assert contract.calibration("p2s", probe_photos=5, level="fmr-1e-4").probe_photos == 2
+    assert contract.calibration("p2s", probe_photos=5, level="none").probe_photos == 5
+    assert contract.calibration("s2s", None, 2, 3).probe_photos == 1
+    with pytest.raises(Uncalibrated):
+        contract.calibration("p2s", probe_photos=0)
+
+
 def test_mismatches_name_both_sides() -> None:
     binding = make_binding()
     same = {"embedder_sha256": "ab" * 32, "preprocessing": dict(binding.preprocessing), "n": N}
@@ -250,9 +276,6 @@ def test_mismatches_name_both_sides() -> None:
     preprocessing = {**binding.preprocessing, "size": 96, "x": 1}
     with pytest.raises(ContractMismatch, match=r"size: contract 112, pack 96; x: contract None"):
         binding.require_embedder(**{**same, "preprocessing": preprocessing})
-    later = {**binding.preprocessing, "version": 2}
-    with pytest.raises(ContractMismatch, match=r"version: contract None, pack 2; .*enroll anew"):
-        binding.require_embedder(**{**same, "preprocessing": later})
     with pytest.raises(ContractMismatch, match=r"cdcd.*0000"):
         binding.require_source(source_id="00" * 32)
     binding.require_source(source_id="cd" * 32, made_with=binding.embedding_id)
@@ -262,20 +285,24 @@ def test_mismatches_name_both_sides() -> None:
         binding.require_contract("1" * 64, what="it")
 
 
-def test_the_embedding_id_names_the_weights_and_the_preprocessing() -> None:
-    binding = make_binding()
-    text = json.dumps(
-        {"embedder_sha256": "ab" * 32, "preprocessing": dict(binding.preprocessing)},
-        sort_keys=True,
-        separators=(",", ":"),
-    )
-    assert binding.embedding_id == hashlib.sha256(text.encode()).hexdigest()
-    assert dataclasses.replace(binding, m=binding.m - 1).embedding_id == binding.embedding_id
-    flipped = {**binding.preprocessing, "flip": "another"}
-    assert dataclasses.replace(binding, preprocessing=flipped).embedding_id != binding.embedding_id
-    assert (
-        dataclasses.replace(binding, embedder_sha256="ef" * 32).embedding_id != binding.embedding_id
-    )
+def test_nobody_is_made_once_of_the_contracts_decoys() -> None:
+    source = make_source()
+    contract = make_contract(binding=make_binding(decoy_source_id=source.source_id))
+    assert contract.nobody(source) is contract.nobody(source)
+    assert "seed" not in repr(contract.nobody(source))
+    with pytest.raises(ContractMismatch, match="bound to the decoy source"):
+        make_contract().nobody(source)
+
+
+def test_at_the_threshold_is_live() -> None:
+    assert LIVENESS.is_live(0.75)
+    assert not LIVENESS.is_live(0.7499)
+    assert not LIVENESS.is_live(float("nan"))
+    assert LIVENESS.worst_species == "screen"
+    LIVENESS.require_graphs(GRAPHS)
+    for other in (GRAPHS[:1], GRAPHS[::-1], ()):
+        with pytest.raises(Uncalibrated, match="calibrate --liveness"):
+            LIVENESS.require_graphs(other)
 
 
 # --- the file ------------------------------------------------------------------------------
@@ -287,13 +314,30 @@ def saved(tmp_path: Path, contract: Contract | None = None) -> Path:
     return path
 
 
-def test_a_file_keeps_everything(tmp_path: Path) -> None:
-    contract = make_contract()
-    loaded = Contract.load(saved(tmp_path, contract), SEALER)
+def reloaded(path: Path, document: Any) -> Contract:
+    path.write_text(json.dumps(document))
+    return Contract.load(path, SEALER)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{}, {"verdict": None, "liveness": None}, {"verdict": Verdict(VERDICT.privacy)}],
+)
+def test_a_file_keeps_everything(tmp_path: Path, changes: dict[str, Any]) -> None:
+    contract = make_contract(**changes)
+    path = saved(tmp_path, contract)
+    document = json.loads(path.read_text())
+    path.write_text(json.dumps(dict(reversed(document.items())), indent=7))
+    loaded = Contract.load(path, SEALER)
     assert loaded.public() == contract.public()
-    assert loaded.calibrations == contract.calibrations
     assert loaded.binding == contract.binding
+    assert loaded.calibrations == contract.calibrations
+    assert (loaded.verdict, loaded.liveness) == (contract.verdict, contract.liveness)
     assert loaded.cohort_seed == contract.cohort_seed
+    # What was not measured is not written, but for the verdict, which is null.
+    assert ("liveness" in document) == (contract.liveness is not None)
+    plain = document["calibrations"][0]["levels"][1]
+    assert not {"groups", "frr_by_photos"} & plain.keys()
 
 
 def test_the_file_is_private_and_alone(tmp_path: Path) -> None:
@@ -334,89 +378,93 @@ def test_the_seed_of_the_cohort_is_sealed_and_never_public(tmp_path: Path) -> No
     assert "seed" not in repr(contract)
 
 
-def test_nobody_is_made_once_of_the_contracts_decoys() -> None:
-    source = make_source()
-    contract = make_contract(binding=make_binding(decoy_source_id=source.source_id))
-    assert contract.nobody(source) is contract.nobody(source)
-    assert "seed" not in repr(contract.nobody(source))
-    with pytest.raises(ContractMismatch, match="bound to the decoy source"):
-        make_contract().nobody(source)
-
-
 def test_another_master_key_does_not_open_it(tmp_path: Path) -> None:
     other = KeyringSealer(MasterKeyring([os.urandom(32)]))
     with pytest.raises(SealError, match="master key is not the one"):
         Contract.load(saved(tmp_path), other)
 
 
-def reloaded(path: Path, document: Any) -> Contract:
-    path.write_text(json.dumps(document))
-    return Contract.load(path, SEALER)
-
-
-def test_edited_thresholds_do_not_load(tmp_path: Path) -> None:
+def test_an_edit_with_its_ids_computed_again_does_not_load(tmp_path: Path) -> None:
     path = saved(tmp_path)
     document = json.loads(path.read_text())
     document["calibrations"][0]["levels"][0]["score_threshold"] = -1.0
+    del document["calibrations"][0]["calibration_id"]
+    edited = Calibration.from_json({**document["calibrations"][0], "calibration_id": ""})
+    document["calibrations"][0] = edited.identified(document["contract_id"]).to_json()
     with pytest.raises(SealError, match="the file was edited"):
         reloaded(path, document)
-    # An attacker can recompute the public ids, but not the seal over them.
-    edited = Calibration.from_json(document["calibrations"][0]).identified(document["contract_id"])
-    document["calibrations"][0] = edited.to_json()
-    with pytest.raises(SealError, match="the file was edited"):
-        reloaded(path, document)
 
 
-def test_formatting_may_change(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("format", "other"), ("version", 2), ("version", True), ("sealed", "!!!"), ("sealed", 3)],
+)
+def test_another_kind_of_file_is_refused(tmp_path: Path, key: str, value: Any) -> None:
+    document = json.loads(saved(tmp_path).read_text())
+    with pytest.raises(ContractError):
+        reloaded(tmp_path / "contract.json", document | {key: value})
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"photo_consistency": "0.25"}, "photo_consistency: "),
+        ({"photo_consistency": None}, "photo_consistency: "),
+        ({"template_foot_point_norm": [0.1, True]}, "template_foot_point_norm: "),
+        ({"binding": {}}, "binding: "),
+        ({"default_level": "no such\n"}, "default_level: "),
+        ({"contract_id": "0" * 64}, "contradicts"),
+        ({"surprise": 1}, "too many"),
+        ({"verdict": {"privacy": VERDICT.privacy.to_json() | {"status": "FAIL"}}}, "contradicts"),
+        ({"liveness": LIVENESS.to_json() | {"bpcer": {}}}, "liveness: "),
+    ],
+)
+def test_a_value_of_another_type_or_range_is_refused(changes: dict[str, Any], reason: str) -> None:
+    with pytest.raises(ContractError, match=reason):
+        Contract.from_json(make_contract().to_json() | changes, cohort_seed="00" * 32)
+
+
+def test_a_sealed_part_that_is_no_such_part_is_refused(tmp_path: Path) -> None:
     path = saved(tmp_path)
     document = json.loads(path.read_text())
-    path.write_text(json.dumps(dict(reversed(document.items())), indent=7))
-    assert Contract.load(path, SEALER).contract_id == make_contract().contract_id
+    sealed = document.pop("sealed")
+    context = contract_module._seal_context(document)
+    good = SEALER.open(base64.b64decode(sealed), context=context)
+    text = base64.b64encode(SEALER.seal(good[:-1], context=context)).decode()
+    with pytest.raises(ContractError, match="32 bytes"):
+        reloaded(path, document | {"sealed": text})
 
 
-MUTATIONS: list[tuple[str, Any]] = [
-    ("format", "other"),
-    ("version", 1),
-    ("version", True),
-    ("contract_id", "0" * 64),
-    ("sealed", "!!!"),
-    ("sealed", 3),
-    ("sealed", ""),
-    ("photo_consistency", "0.25"),
-    ("photo_consistency", 1e400),
-    ("photo_consistency", None),
-    ("probe_consistency", None),
-    ("template_foot_point_norm", [0.1]),
-    ("template_foot_point_norm", [0.1, True]),
-    ("template_stranger_similarity", "1.5"),
-    ("template_stranger_similarity", 1e400),
-    ("calibrations", {}),
-    ("calibrations", [[]]),
-    ("binding", []),
-    ("binding", {}),
-    ("recorded", []),
-    ("recorded", {"a": {"b": {"c": {"d": {"e": {}}}}}}),
-    ("recorded", {"a": "x" * 5000}),
-    ("recorded", {"a": "\ud800"}),
-    ("default_level", "nope"),
-    ("default_level", 10**30),
-    ("surprise", 1),
-]
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner),
+    max_leaves=6,
+)
 
 
-@pytest.mark.parametrize(("key", "value"), MUTATIONS)
-def test_broken_files_are_refused(tmp_path: Path, key: str, value: Any) -> None:
+@settings(
+    max_examples=150,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+@given(st.data())
+def test_no_edit_of_a_value_is_accepted(tmp_path: Path, data: st.DataObject) -> None:
+    """The seal covers all: verdict, liveness, groups and thresholds."""
     path = saved(tmp_path)
     document = json.loads(path.read_text())
-    with pytest.raises((ContractError, SealError)):
-        reloaded(path, document | {key: value})
-
-
-@pytest.mark.parametrize("key", sorted(json.loads(canonical_json(make_contract().public()))))
-def test_missing_keys_are_refused(tmp_path: Path, key: str) -> None:
-    path = saved(tmp_path)
-    document = json.loads(path.read_text())
-    del document[key]
+    place: Any = document
+    while True:
+        keys = sorted(place) if isinstance(place, dict) else list(range(len(place)))
+        key = data.draw(st.sampled_from(keys))
+        if isinstance(place[key], dict | list) and place[key] and data.draw(st.booleans()):
+            place = place[key]
+            continue
+        break
+    value = data.draw(json_values | st.just("removed"))
+    if value == place[key]:
+        return
+    place[key] = value
+    if value == "removed":
+        del place[key]
     with pytest.raises((ContractError, SealError)):
         reloaded(path, document)
 
@@ -426,16 +474,14 @@ def test_missing_keys_are_refused(tmp_path: Path, key: str) -> None:
     [
         b"",
         b"[]",
-        b"null",
         b"\xff\xfe",
-        b"{",
         b'{"format": NaN}',
         b'{"format": "a", "format": "b"}',
-        b"[" * 100_000,
-        b'{"a":' * 100_000,
+        b'{"a":' * 90_000,
         b'{"version": ' + b"9" * 5000 + b"}",
+        b"[" * (MAX_PARTS + 1),
     ],
-    ids=range(10),
+    ids=range(8),
 )
 def test_what_is_no_json_object_is_refused(tmp_path: Path, data: bytes) -> None:
     path = tmp_path / "contract.json"
@@ -454,118 +500,3 @@ def test_size_is_bounded_before_parsing(tmp_path: Path, monkeypatch: pytest.Monk
 def test_an_absent_file_names_the_remedy(tmp_path: Path) -> None:
     with pytest.raises(ContractError, match="veilface calibrate"):
         Contract.load(tmp_path / "none.json", SEALER)
-    with pytest.raises(ContractError):
-        Contract.load(tmp_path, SEALER)
-
-
-json_values = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner),
-    max_leaves=6,
-)
-
-
-@settings(
-    max_examples=150,
-    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
-)
-@given(st.data())
-def test_no_edit_of_a_value_is_accepted(tmp_path: Path, data: st.DataObject) -> None:
-    path = saved(tmp_path)
-    document = json.loads(path.read_text())
-    place: Any = document
-    while True:
-        keys = sorted(place) if isinstance(place, dict) else list(range(len(place)))
-        key = data.draw(st.sampled_from(keys))
-        if isinstance(place[key], dict | list) and place[key] and data.draw(st.booleans()):
-            place = place[key]
-            continue
-        break
-    value = data.draw(json_values)
-    if value == place[key]:
-        return
-    place[key] = value
-    with pytest.raises((ContractError, SealError)):
-        reloaded(path, document)
-
-
-def test_a_sealed_part_that_is_no_such_part_is_refused(tmp_path: Path) -> None:
-    path = saved(tmp_path)
-    document = json.loads(path.read_text())
-    sealed = document.pop("sealed")
-    context = contract_module._seal_context(document)
-    good = SEALER.open(base64.b64decode(sealed), context=context)
-    for plain in (b"", good[:-1], good + b"0"):
-        text = base64.b64encode(SEALER.seal(plain, context=context)).decode()
-        with pytest.raises(ContractError, match="32 bytes"):
-            reloaded(path, document | {"sealed": text})
-    text = base64.b64encode(SEALER.seal(good, context=context)).decode()
-    assert reloaded(path, document | {"sealed": text}).cohort_seed == good
-
-
-def test_the_layout_of_another_version_is_refused_with_the_remedy(tmp_path: Path) -> None:
-    path = saved(tmp_path)
-    document = json.loads(path.read_text())
-    with pytest.raises(ContractError, match="run `veilface calibrate` again"):
-        reloaded(path, document | {"version": 2})
-
-
-def test_the_calibration_of_the_most_photos_that_are_not_more_serves() -> None:
-    lax, strict = make_calibration().levels[0], Level("fmr-1e-4", 1e-4, 4.0, RATE, RATE)
-    contract = make_contract(
-        calibrations=(
-            make_calibration(levels=(lax, strict)),
-            make_calibration(levels=(lax, strict), probe_photos=2),
-            make_calibration(levels=(lax,), probe_photos=5),
-            make_calibration(**LIFTED),
-        )
-    )
-    chosen = [
-        contract.calibration("p2s", probe_photos=photos).probe_photos for photos in range(1, 9)
-    ]
-    assert chosen == [1, 2, 2, 2, 5, 5, 5, 5]
-    # A level that more photos do not resolve is taken from fewer.
-    assert contract.calibration("p2s", probe_photos=5, level="fmr-1e-4").probe_photos == 2
-    assert contract.calibration("p2s", probe_photos=5, level="fmr-1e-2").probe_photos == 5
-    assert contract.calibration("p2s", probe_photos=5, level="none").probe_photos == 5
-    assert contract.calibration("s2s", None, 2, 3).probe_photos == 1
-    with pytest.raises(Uncalibrated):
-        contract.calibration("p2s", probe_photos=0)
-
-
-def test_frozen() -> None:
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        make_contract().photo_consistency = 0.0  # type: ignore[misc]
-
-
-def test_a_file_of_more_values_than_any_contract_has_is_not_parsed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = saved(tmp_path)
-    document = json.loads(path.read_text())
-    wide = tmp_path / "wide.json"
-    wide.write_text(json.dumps(document | {"recorded": {"a": [[]] * MAX_PARTS}}))
-    with monkeypatch.context() as patch:
-        patch.setattr("templates.contract.canonical.json.loads", None)
-        with pytest.raises(ContractError, match="more than 100000 values"):
-            Contract.load(wide, SEALER)
-    assert Contract.load(path, SEALER).contract_id == document["contract_id"]
-
-
-def test_the_largest_contract_has_fewer_values_than_are_read() -> None:
-    levels = tuple(
-        Level(f"level-{i}", 1e-2, 2.0, RATE, RATE, dict.fromkeys(range(1, 11), RATE))
-        for i in range(MAX_LEVELS)
-    )
-    entries = tuple(
-        make_calibration(mode="s2s", probe_m=m, foot_point_norm=(0.2, 0.9), levels=levels)
-        for m in range(1, MAX_CALIBRATIONS + 1)
-    )
-    binding = make_binding(n=MAX_CALIBRATIONS + 2, axes=MAX_CALIBRATIONS + 2)
-    largest = make_contract(
-        binding=binding,
-        calibrations=entries,
-        default_level="level-0",
-        recorded={str(i): i for i in range(MAX_ITEMS)},
-    )
-    assert not too_many_parts(json.dumps(largest.public()).encode(), MAX_PARTS // 2)
