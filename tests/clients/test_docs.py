@@ -15,7 +15,7 @@ from veilface_client import Client
 from veilface_client.errors import error_class
 
 ROOT = Path(__file__).resolve().parents[2]
-CLIENT, DISTRIBUTION = PAGES = ("docs/client.md", "clients/python/README.md")
+CLIENT, DISTRIBUTION = PAGES = ("docs/python.md", "clients/python/README.md")
 EXAMPLE = "http://127.0.0.1:8421"
 
 
