@@ -259,7 +259,7 @@ def test_moved_templates_are_the_same_sets_in_the_new_rotation(
 def test_what_another_rounding_costs(
     tmp_path: Path, keyring: MasterKeyring, metric: Metric
 ) -> None:
-    """The numbers that the module and docs/deploy.md state, at the service's dimensions."""
+    """The numbers that docs/results/deployment.md states, at the service's dimensions."""
     store = TemplateStore(f"sqlite:///{tmp_path / 'veilface.db'}", keyring)
     store.upgrade()
     store.tenants.create("default")
