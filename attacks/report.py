@@ -13,7 +13,7 @@ RESULTS = {
 }
 """The first line of a report, by ``passed``."""
 FORMAT = "veilface audit"
-VERSION = 3
+VERSION = 1
 Document = dict[str, Any]
 
 

@@ -145,7 +145,6 @@ def _attributes(rows: Sequence[Row]) -> Iterable[str]:
                 "accuracy %",
                 "balanced %",
                 "chance %",
-                "bits (null)",
                 "leakage",
             ],
             [
@@ -156,13 +155,11 @@ def _attributes(rows: Sequence[Row]) -> Iterable[str]:
                     interval_cell({**row, "value": row["accuracy"], "errors": row["correct"]}),
                     percent(row["balanced_accuracy"]),
                     percent(row["chance"]),
-                    f"{fixed(row['mutual_information_bits'], 3)} "
-                    f"({fixed(row['mutual_information_null']['mean'], 3)})",
                     plain(row["leakage"]),
                 ]
                 for row in of_attribute
             ],
-            [True, True, True, False, False, False, False, True],
+            [True, True, True, False, False, False, True],
         )
 
 

@@ -24,7 +24,6 @@ from api.cli.results import Plan
 from api.service.opening import file_sealer, open_keyring
 from api.settings import Settings
 from attacks.attributes.audit import (
-    AttributeAuditPlan,
     attribute_outcomes,
     default_lifting,
     labelled_faces,
@@ -32,7 +31,7 @@ from attacks.attributes.audit import (
 )
 from attacks.attributes.experiment import KNN, LOGISTIC
 from attacks.attributes.plan import OUR_DIMS, PAPER_DIMS, AttributePlan, schemes_of
-from attacks.outcomes import GENERATED, RAW_SCHEME, Scheme
+from attacks.outcomes import GENERATED, RAW, Scheme
 from attacks.population import LEAST_FITTED
 from attacks.report import document
 from models.pack import ModelPack
@@ -45,7 +44,7 @@ from verify.fairface_labels import CLASSES
 from verify.preparation import acquired_json
 
 STRATEGIES = (
-    "raw",
+    RAW,
     Strategy.RANDOM,
     Strategy.ADVERSARIAL,
     Strategy.HYBRID,
@@ -176,23 +175,20 @@ def fairface(
     ours = listed_dims(generated_dim, "--generated-dim", n=n, example="16,32")
     if service_dim >= n:
         raise UsageError(f"--service-dim must be below the {n} numbers of what is lifted")
-    grid = schemes_of(
+    schemes = schemes_of(
+        strategies=[name for name in STRATEGIES if name in strategies and name != RAW],
         dims=listed_dims(dim, "--dim", n=pack.info.n, example="2,4"),
         generated_dims=tuple(dict.fromkeys((*ours, service_dim))),
         axes=axes,
     )
-    schemes = [
-        scheme
-        for scheme in grid
-        if scheme.decoys == GENERATED or scheme.strategy in {*strategies, RAW_SCHEME.strategy}
-    ]
     trained = LOGISTIC in listed_names(attackers, ATTACKERS, "--attackers")
     audited = Scheme(str(Strategy.ADVERSARIAL), GENERATED, service_dim, axes)
     labels = fairface_labels(root, "train"), fairface_labels(root, "val")
-    plan = AttributeAuditPlan(
-        schemes=tuple(schemes),
+    plan = AttributePlan(
+        schemes=schemes,
         attributes=wanted,
-        attackers=AttributePlan(k=neighbours, trained=trained),
+        k=neighbours,
+        trained=trained,
         lifting=default_lifting(len(labels[0])) if lifting is None else lifting,
         attack=attack,
         attacked=attacked,
@@ -200,7 +196,7 @@ def fairface(
         drop_duplicates=drop_duplicates,
         seed=seed,
     )
-    plan.require_faces(labels[0])
+    plan.attacker_faces(len(labels[0]))
     photos, faces = [], []
     for part in plan.sample(*labels):
         extraction = extract(pack, list(part), aligned=aligned, settings=settings, cache=cache)

@@ -7,18 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from attacks.attributes.experiment import run_scheme
-from attacks.attributes.faces import (
-    LabelledFaces,
-    Split,
-    attacker_faces,
-    split,
-)
-from attacks.attributes.plan import (
-    AttributePlan,
-    prepare,
-    require_decoys,
-    require_folds,
-)
+from attacks.attributes.faces import LabelledFaces, Split, split
+from attacks.attributes.plan import AttributePlan, prepare
 from attacks.attributes.rows import AttributeRow, strongest
 from attacks.errors import AuditError
 from attacks.outcomes import (
@@ -66,85 +56,9 @@ def labelled_faces(
     )
 
 
-def _sample(labels: Mapping[Path, Label], most: int | None, seed: int) -> Mapping[Path, Label]:
-    """Choose at most so many photos at random; all where None."""
-    if most is None or most >= len(labels):
-        return labels
-    photos = list(labels)
-    chosen = np.random.default_rng([seed, 3]).permutation(len(photos))[:most]
-    return {photos[index]: labels[photos[index]] for index in sorted(chosen.tolist())}
-
-
-@dataclass(frozen=True, kw_only=True)
-class AttributeAuditPlan:
-    """What is inferred from the templates of which schemes, and how.
-
-    Parameters
-    ----------
-    lifting
-        Training faces that are the lifting database; see :func:`default_lifting`.
-    attack, attacked
-        Most training faces that the attacker has, and most validation faces that are attacked;
-        None for all.
-    axes
-        That faces are projected on for generated decoys; None for all.
-    drop_duplicates
-        Cosine from which an attacked face resembles a training face too much; None to keep all.
-    """
-
-    schemes: tuple[Scheme, ...]
-    attributes: tuple[str, ...]
-    attackers: AttributePlan
-    lifting: int
-    attack: int | None = None
-    attacked: int | None = None
-    axes: int | None = None
-    drop_duplicates: float | None = None
-    seed: int = 0
-
-    def sample(
-        self, train: Mapping[Path, Label], validation: Mapping[Path, Label]
-    ) -> tuple[Mapping[Path, Label], Mapping[Path, Label]]:
-        """Choose the photos that take part, so that no others are embedded.
-
-        A face costs a hundred times what an attack on it does.
-        """
-        most = None if self.attack is None else self.lifting + self.attack
-        return _sample(train, most, self.seed), _sample(validation, self.attacked, self.seed)
-
-    def attacker_faces(self, training: int) -> int:
-        """Return how many of so many training faces are the attacker's.
-
-        Raises
-        ------
-        AuditError
-            There are too few training faces.
-        """
-        # Which photos give no embedding is not known beforehand.
-        most = None if self.attack is None else min(self.attack, max(1, training - self.lifting))
-        return attacker_faces(training, lifting=self.lifting, attack=most)
-
-    def require_faces(self, train: Mapping[Path, Label]) -> None:
-        """Refuse, before anything is embedded, what would fail even if every photo had a face.
-
-        Raises
-        ------
-        AuditError
-            There are too few training faces for the plan.
-        """
-        attack = self.attacker_faces(len(train))
-        require_folds(attack, self.attackers)
-        require_decoys(
-            self.schemes,
-            list(train.values()),
-            lifting=self.lifting,
-            fold=attack // self.attackers.folds,
-        )
-
-
 @dataclass(frozen=True, eq=False)
 class AttributeAudit:
-    """What an audit found."""
+    """Rows, the parts that faces were dealt into, and how many were dropped as duplicates."""
 
     rows: list[AttributeRow]
     split: Split
@@ -161,7 +75,7 @@ class AttributeAudit:
 
 
 def run_attribute_audit(
-    plan: AttributeAuditPlan,
+    plan: AttributePlan,
     train: LabelledFaces,
     validation: LabelledFaces,
     *,
@@ -185,9 +99,9 @@ def run_attribute_audit(
     """
     duplicates = 0
     if plan.drop_duplicates is not None:
-        # FairFace's two parts share photos, and who has the victim's own face infers nothing.
+        # FairFace's two parts share photos, and the victim's own face in hand infers nothing.
         dropped = resembling_rows(
-            validation.descriptors, train.descriptors, cosine=plan.drop_duplicates
+            validation.embeddings, train.embeddings, cosine=plan.drop_duplicates
         )
         validation = validation.take(np.setdiff1d(np.arange(len(validation)), dropped))
         duplicates = len(dropped)
@@ -200,19 +114,18 @@ def run_attribute_audit(
         seed=plan.seed,
     )
     if generator is None:
-        generator = DecoyGenerator.fit(parts.lifting.descriptors)
+        generator = DecoyGenerator.fit(parts.lifting.embeddings)
         generator = generator.reduced(plan.axes or generator.k)
     else:
         people = [str(number) for number in range(len(parts.attacked))]
-        require_others(generator, parts.attacked.descriptors, people)
-    whole = prepare(parts, plan=plan.attackers, seed=plan.seed)
-    ours = prepare(parts.along(generator), plan=plan.attackers, seed=plan.seed, generator=generator)
-    setups = [ours if scheme.decoys == GENERATED else whole for scheme in plan.schemes]
+        require_others(generator, parts.attacked.embeddings, people)
+    whole = prepare(parts, plan=plan)
+    ours = prepare(parts.along(generator), plan=plan, generator=generator)
     rows: list[AttributeRow] = []
     progress(0.0)
-    for number, (setup, scheme) in enumerate(zip(setups, plan.schemes, strict=True), start=1):
-        rows += run_scheme(setup, scheme)
-        progress(number / len(setups))
+    for number, scheme in enumerate(plan.schemes, start=1):
+        rows += run_scheme(ours if scheme.decoys == GENERATED else whole, scheme)
+        progress(number / len(plan.schemes))
     return AttributeAudit(rows, parts, duplicates)
 
 
@@ -238,7 +151,7 @@ def attribute_outcomes(rows: Sequence[AttributeRow], *, audited: Scheme) -> list
     """
     best = strongest(rows)
     gains = {
-        attribute: row.accuracy - row.chance
+        attribute: row.accuracy.value - row.chance
         for (scheme, attribute, _), row in best.items()
         if scheme == RAW_SCHEME
     }
@@ -258,14 +171,14 @@ def attribute_outcomes(rows: Sequence[AttributeRow], *, audited: Scheme) -> list
                 knowledge=knowledge,
                 assumption=f"{_HAS[knowledge]}; success is the right {attribute}.",
                 scheme=scheme,
-                measured=row.measures.accuracy,
+                measured=row.accuracy,
                 chance=row.chance_of_predictions,
                 unjudged=unjudged,
                 details={
                     "majority": row.chance,
                     "raw_gain": gains[attribute],
-                    "balanced_accuracy": row.measures.balanced_accuracy,
-                    "leakage": str(row.measures.leakage),
+                    "balanced_accuracy": row.balanced_accuracy,
+                    "leakage": str(row.leakage),
                     "chosen_among": "the attacker's own held-out faces",
                 },
             )

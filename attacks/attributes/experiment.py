@@ -1,29 +1,42 @@
-"""The attribute attacks on one scheme: lift, attack, measure."""
+"""The attribute attacks on one scheme: lift, look at the templates, guess, measure.
 
-import time
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+The attacker lifts its own faces by the same algorithm. A secret pool it does not have: it uses
+faces of its own, each fold's as the decoys of the fold, so that neither a face nor its decoys had a
+part in the axes or in the gallery that it is judged by. The generator it has.
+"""
+
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from attacks.attributes.attackers import Logistic, TrainingSet
-from attacks.attributes.features import Features
-from attacks.attributes.measures import InferenceMeasures, measure
-from attacks.attributes.observations import (
-    ByAttribute,
-    Codes,
-    observe_attacked,
-    observe_own,
-)
-from attacks.attributes.plan import Setup
-from attacks.attributes.rows import AttributeRow
-from attacks.outcomes import POOLED, KnowledgeLevel, Scheme
-from templates.distances import Metric
+from attacks.attributes.faces import LabelledFaces
+from attacks.attributes.features import features_of
+from attacks.attributes.neighbours import METRICS, Attacked, nearest_neighbours, vote
+from attacks.attributes.plan import Setup, Side
+from attacks.attributes.rows import AttributeRow, measure
+from attacks.errors import AuditError
+from attacks.outcomes import GENERATED, POOLED, RAW_SCHEME, KnowledgeLevel, Scheme
+from attacks.second_order import likeliest_embeddings
+from attacks.stored.known_pool import find_decoys, strip
+from templates.keys.randomness import Keystream
+from templates.space.lifting import Strategy, lift
+from templates.space.subspace import SubspaceBatch
 
-ByClass = Mapping[str, NDArray[np.float64]]
+Codes = NDArray[np.int64]
+Observed = dict[tuple[str, ...], NDArray[Any]]
+"""What attackers compute from the templates of some faces, a row for each: ``("features",)``;
+``("vote", metric, attribute)``, what the paper's attacker says; ``("truth", attribute)``; and of
+attackers who know the decoys ``("points",)``, guesses of the embeddings, and ``("guessed",)``,
+features of these."""
 
 KNN, LOGISTIC, SECOND, STRIP = "knn", "logistic", "second moments", "strip"
+_TILE_BYTES = 64 << 20
+_TILE_ROWS = 256
+# Of the logistic regression on standardised features: little for few faces, as many of the
+# features say the same, more for many.
+_LOGISTIC_CS = (1e-4, 1e-3, 1e-2, 1e-1)
 
 
 def run_scheme(setup: Setup, scheme: Scheme) -> list[AttributeRow]:
@@ -32,7 +45,7 @@ def run_scheme(setup: Setup, scheme: Scheme) -> list[AttributeRow]:
     Parameters
     ----------
     scheme
-        Raw descriptors, or a strategy with the pool of the lifting faces or the generator. hybrid+
+        Raw embeddings, or a strategy with the pool of the lifting faces or the generator. hybrid+
         lifts the attacked faces by their true labels, as the paper does.
 
     Returns
@@ -47,111 +60,220 @@ def run_scheme(setup: Setup, scheme: Scheme) -> list[AttributeRow]:
         The scheme cannot be run on these faces.
     LiftingError, DecoyError
         There are too few decoys for the scheme.
-
-    Notes
-    -----
-    The attacker lifts its own faces by the same algorithm. A secret pool it does not have: it uses
-    faces of its own, each fold's as the decoys of the fold, so that neither a face nor its decoys
-    had a part in the axes or in the gallery that it is judged by. The generator it has.
-    Memory holds the templates of one tile at a time.
     """
-    own, is_held_out = observe_own(setup, scheme)
-    victims = observe_attacked(setup, scheme)
-    training, validation = (
-        own.take(np.flatnonzero(~is_held_out)),
-        own.take(np.flatnonzero(is_held_out)),
-    )
-    predictions: list[_Predictions] = [
-        # The vote learns from no template, so that all of the attacker's own try it.
-        _Predictions(
-            KNN, metric, KnowledgeLevel.ALGORITHM, victims.votes[metric], own.votes[metric]
-        )
-        for metric in victims.votes
-    ]
-    truths = training.truth, validation.truth
-    features = training.features, validation.features, victims.features
-    if setup.plan.trained:
-        choices = _trained(setup, features, truths)
-        predictions.append(_Predictions(LOGISTIC, None, KnowledgeLevel.ALGORITHM, *choices))
-    if not (victims.guessed is None or training.guessed is None or validation.guessed is None):
-        name, knowledge = SECOND, KnowledgeLevel.ALGORITHM
-        if scheme.decoys == POOLED:
-            name, knowledge = STRIP, KnowledgeLevel.DECOYS
-        features = training.guessed, validation.guessed, victims.guessed
-        choices = _trained(setup, features, truths, foot=True)
-        predictions.append(_Predictions(name, None, knowledge, *choices))
+    plan, attack = setup.plan, setup.split.attack
+    own, held_out = observe_own(setup, scheme)
+    attacked = observe_attacked(setup, scheme)
+    training, choosing = ({key: part[~held_out] for key, part in own.items()},
+                          {key: part[held_out] for key, part in own.items()})  # fmt: skip
     rows: list[AttributeRow] = []
-    for prediction in predictions:
-        held_out_truth = own.truth if prediction.attacker == KNN else validation.truth
-        rows += _rows(setup, scheme, prediction, victims.truth, held_out_truth)
+
+    def add(
+        attacker: str, metric: str | None, known: KnowledgeLevel, attribute: str,
+        said: Codes, said_at_home: Codes, truth_at_home: Codes,
+    ) -> None:  # fmt: skip
+        classes = attack.classes[attribute]
+
+        def against(predicted: Codes, truth: Codes) -> AttributeRow:
+            return measure(
+                predicted, truth, scheme=scheme, attribute=attribute, attacker=attacker,
+                metric=metric, knowledge=known, classes=classes,
+                training=attack.labels[attribute], seed=plan.seed,
+            )  # fmt: skip
+
+        row = against(said, attacked["truth", attribute])
+        rows.append(row.chosen_by(against(said_at_home, truth_at_home)))
+
+    for name, metric, attribute in (key for key in attacked if key[0] == "vote"):
+        # The vote learns from no template, so that all of the attacker's own try it.
+        key, truth = (name, metric, attribute), own["truth", attribute]
+        add(KNN, metric, KnowledgeLevel.ALGORITHM, attribute, attacked[key], own[key], truth)
+    trained: list[tuple[str, KnowledgeLevel, list[tuple[str, ...]]]] = []
+    if plan.trained:
+        trained.append((LOGISTIC, KnowledgeLevel.ALGORITHM, [("features",)]))
+    if ("points",) in attacked:
+        name, known = SECOND, KnowledgeLevel.ALGORITHM
+        if scheme.decoys == POOLED:
+            name, known = STRIP, KnowledgeLevel.DECOYS
+        trained.append((name, known, [("guessed",), ("points", "guessed")]))
+    for name, known, alternatives in trained:
+        for attribute in attack.classes:
+            said = trained_on(training, choosing, attacked, attribute, alternatives)
+            add(name, None, known, attribute, *said, choosing["truth", attribute])
     return rows
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class _Predictions:
-    """What one attacker says of the attacked faces, and of its own held-out ones."""
+def trained_on(
+    training: Observed,
+    choosing: Observed,
+    attacked: Observed,
+    attribute: str,
+    alternatives: Sequence[tuple[str, ...]],
+) -> tuple[Codes, Codes]:
+    """Train a logistic regression on templates that the attacker lifted itself.
 
-    attacker: str
-    metric: Metric | None
-    knowledge: KnowledgeLevel
-    attacked: ByAttribute
-    held: ByAttribute
-    seconds: float = 0.0
+    Parameters
+    ----------
+    choosing
+        Templates that the attacker lifted, and does not learn from: it chooses the regularisation
+        and the features by them.
+    alternatives
+        The names of the parts that are learnt from together, each a choice.
 
-
-def _trained(
-    setup: Setup,
-    features: tuple[Features, Features, Features],
-    truths: tuple[ByAttribute, ByAttribute],
-    *,
-    foot: bool = False,
-) -> tuple[ByAttribute, ByAttribute, float]:
-    """Train an attacker; its predictions of the attacked and of the held-out faces, and seconds.
-
-    ``features`` are of the training, the held-out and the attacked faces, ``truths`` of the first
-    two.
+    Returns
+    -------
+    Predictions of the attacked faces, and of those that were chosen by.
     """
-    start = time.perf_counter()
-    training, held_out, attacked = features
-    classes = {name: len(of) for name, of in setup.split.attack.classes.items()}
-    model = Logistic(TrainingSet(training, truths[0], held_out, truths[1], classes), foot=foot)
-    made = _chosen(model.scores(attacked)), _chosen(model.scores(held_out))
-    return *made, time.perf_counter() - start
+    # Imported here: only an audit of attributes needs the library.
+    from sklearn.linear_model import LogisticRegression
+    from sklearn.pipeline import make_pipeline
+    from sklearn.preprocessing import StandardScaler
+
+    truth = training["truth", attribute]
+    if len(only := np.unique(truth)) == 1:
+        return np.full(_count(attacked), only[0]), np.full(_count(choosing), only[0])
+    best = -1.0
+    for names in alternatives:
+        rows, at_home, away = (
+            np.hstack([part[name,] for name in names]).astype(np.float64)
+            for part in (training, choosing, attacked)
+        )
+        for c in _LOGISTIC_CS:
+            model = make_pipeline(StandardScaler(), LogisticRegression(C=c, max_iter=1000))
+            model.fit(rows, truth)
+            said = model.predict(at_home)
+            score = float(np.mean(said == choosing["truth", attribute]))
+            if score > best:  # of equals the more regularised
+                best, chosen = score, (model.predict(away), said)
+    return chosen
 
 
-def _rows(
+def _count(observed: Observed) -> int:
+    return len(next(iter(observed.values())))
+
+
+def observe_attacked(setup: Setup, scheme: Scheme) -> Observed:
+    """Lift the attacked faces with the deployment's decoys, and look at their templates."""
+    stream = Keystream.seeded("attributes", setup.plan.seed, "attacked", *_purpose(scheme))
+    side = setup.side
+    return _observe(setup, scheme, side, setup.split.attacked, stream, voters=side.gallery)
+
+
+def observe_own(setup: Setup, scheme: Scheme) -> tuple[Observed, NDArray[np.bool_]]:
+    """Lift the attacker's own faces, fold by fold; which of them are held out.
+
+    They are searched among the nearby faces only.
+    """
+    parts, held_out = [], []
+    lifts = 1 if scheme == RAW_SCHEME else setup.plan.lifts_of(len(setup.split.attack))
+    for number, fold in enumerate(setup.folds):
+        for turn in range(lifts):
+            stream = Keystream.seeded(
+                "attributes", setup.plan.seed, "own", number, turn, *_purpose(scheme)
+            )
+            parts.append(
+                _observe(
+                    setup, scheme, fold.side, fold.own, stream,
+                    voters=fold.side.nearby, entries=fold.entries,
+                )
+            )  # fmt: skip
+            held_out.append(fold.held_out)
+    return _stacked(parts), np.concatenate(held_out)
+
+
+def _stacked(parts: Sequence[Observed]) -> Observed:
+    return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+
+
+def _observe(
     setup: Setup,
     scheme: Scheme,
-    predictions: _Predictions,
-    truth: ByAttribute,
-    held_out_truth: ByAttribute,
-) -> Iterator[AttributeRow]:
-    attack = setup.split.attack
-    for name, predicted in predictions.attacked.items():
-        classes = attack.classes[name]
+    side: Side,
+    faces: LabelledFaces,
+    stream: Keystream,
+    *,
+    voters: LabelledFaces,
+    entries: Codes | None = None,
+) -> Observed:
+    """Lift faces, a tile at a time, and compute what attackers need of the templates.
 
-        def against(predicted: Codes, truth: Codes, name: str = name) -> InferenceMeasures:
-            return measure(
-                predicted,
-                truth,
-                training=attack.labels[name],
-                classes=len(attack.classes[name]),
-                seed=setup.seed,
-            )
-
-        yield AttributeRow(
-            scheme=scheme,
-            attribute=name,
-            attacker=predictions.attacker,
-            metric=predictions.metric,
-            knowledge=predictions.knowledge,
-            classes=classes,
-            measures=against(predicted, truth[name]),
-            held_out=against(predictions.held[name], held_out_truth[name]).strength,
-            seed=setup.seed,
-            seconds=predictions.seconds,
-        )
+    Memory holds the templates of one tile. ``entries`` are the faces' own positions in the side's
+    pool, where they are in it.
+    """
+    rows = _TILE_BYTES // (4 * faces.n * max(1, scheme.dim))
+    step = int(np.clip(rows, 1, _TILE_ROWS))
+    tiles = []
+    for start in range(0, len(faces), step):
+        chosen = np.arange(start, min(start + step, len(faces)))
+        tile = faces.take(chosen)
+        attacked = _lifted(setup, scheme, side, tile, stream)
+        own = None if entries is None else entries[chosen]
+        tiles.append(_look(setup, scheme, side, attacked, voters, own))
+        tiles[-1] |= {("truth", name): codes for name, codes in tile.labels.items()}
+    return _stacked(tiles)
 
 
-def _chosen(scores: ByClass) -> ByAttribute:
-    return {name: np.argmax(values, axis=1).astype(np.int64) for name, values in scores.items()}
+def _lifted(
+    setup: Setup, scheme: Scheme, side: Side, faces: LabelledFaces, stream: Keystream
+) -> Attacked:
+    if scheme == RAW_SCHEME:
+        return faces.embeddings
+    attributes = faces.decoy_attributes() if scheme.strategy == Strategy.HYBRID_PLUS else None
+    if scheme.strategy == Strategy.HYBRID_PLUS and attributes is None:
+        raise AuditError("hybrid+ chooses decoys by gender and race: give labels of both")
+    if scheme.decoys == GENERATED and setup.generator is None:
+        raise AuditError("schemes with generated decoys need a decoy generator")
+    return lift(
+        faces.embeddings,
+        strategy=scheme.strategy,
+        m=scheme.dim,
+        source=setup.source(scheme, side),
+        stream=stream,
+        attributes=attributes,
+    )
+
+
+def _look(
+    setup: Setup,
+    scheme: Scheme,
+    side: Side,
+    attacked: Attacked,
+    voters: LabelledFaces,
+    own: Codes | None,
+) -> Observed:
+    plan, ks = setup.plan, setup.plan.feature_ks
+    metrics = METRICS if scheme != RAW_SCHEME else METRICS[:1]
+    near = nearest_neighbours(attacked, side.nearby.embeddings, k=plan.neighbours, metrics=metrics)
+    features = features_of(attacked, side.axes, near, side.nearby, ks=ks)
+    if len(voters) > len(side.nearby):
+        near = nearest_neighbours(attacked, voters.embeddings, k=plan.k, metrics=metrics)
+    seen: Observed = {("features",): features}
+    seen |= {
+        ("vote", str(metric), name): vote(near[metric], voters.labels[name], len(of), k=plan.k)
+        for metric in metrics
+        for name, of in voters.classes.items()
+    }
+    if scheme.decoys is None or not isinstance(attacked, SubspaceBatch):
+        return seen
+    points = _guess(setup, scheme, side, attacked, own)
+    near = nearest_neighbours(points, side.nearby.embeddings, k=max(ks), metrics=METRICS[:1])
+    guessed = features_of(points, side.axes, near, side.nearby, ks=ks)
+    if scheme.decoys == GENERATED:
+        guessed = np.hstack([guessed, features])
+    return seen | {("points",): points, ("guessed",): guessed}
+
+
+def _guess(
+    setup: Setup, scheme: Scheme, side: Side, templates: SubspaceBatch, own: Codes | None
+) -> NDArray[np.float32]:
+    """Guess the embeddings, (P, n): with the pool, or by second moments with the generator."""
+    if side.faces is not None and setup.decoys is not None and scheme.decoys == GENERATED:
+        return likeliest_embeddings(templates, side.faces, setup.decoys).astype(np.float32)
+    entries = side.entries.embeddings
+    most = Strategy(scheme.strategy).decoys(scheme.dim)
+    return strip(templates, entries, find_decoys(templates, entries, most=most, own=own))
+
+
+def _purpose(scheme: Scheme) -> tuple[str | int, ...]:
+    """Name a scheme in a seed, so that each has randomness of its own."""
+    return scheme.strategy, scheme.decoys or "", scheme.dim

@@ -16,11 +16,11 @@ Codes = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LabelledFaces:
-    """Descriptors of faces, and the labels of every one.
+    """Embeddings of faces, and the labels of every one.
 
     Parameters
     ----------
-    descriptors : (N, n) float32
+    embeddings : (N, n) float32
         Unit rows.
     labels
         By attribute: (N,) int64, the number of each face's class.
@@ -30,37 +30,29 @@ class LabelledFaces:
     Raises
     ------
     InvalidEmbedding
-        A descriptor is not a finite unit vector.
+        A row is not a finite unit vector.
     """
 
-    descriptors: Array32
+    embeddings: Array32
     labels: Mapping[str, Codes]
     classes: Mapping[str, tuple[str, ...]]
 
     def __post_init__(self) -> None:
-        rows = np.ascontiguousarray(unit_descriptors(self.descriptors), dtype=np.float32)
-        object.__setattr__(self, "descriptors", rows)
+        rows = np.ascontiguousarray(unit_descriptors(self.embeddings), dtype=np.float32)
+        object.__setattr__(self, "embeddings", rows)
 
     def __len__(self) -> int:
-        return len(self.descriptors)
-
-    def __repr__(self) -> str:
-        return f"LabelledFaces({len(self)} faces, n={self.n}, {', '.join(self.classes)})"
+        return len(self.embeddings)
 
     @property
     def n(self) -> int:
-        """Descriptor dimension."""
-        return int(self.descriptors.shape[1])
-
-    @property
-    def attributes(self) -> tuple[str, ...]:
-        """Names of the attributes."""
-        return tuple(self.classes)
+        """Dimension of the embeddings."""
+        return int(self.embeddings.shape[1])
 
     @classmethod
     def of_names(
         cls,
-        descriptors: Array32,
+        embeddings: Array32,
         labels: Mapping[str, Sequence[str]],
         classes: Mapping[str, Sequence[str]],
     ) -> "LabelledFaces":
@@ -74,35 +66,31 @@ class LabelledFaces:
         codes: dict[str, Codes] = {}
         for attribute, names in labels.items():
             place = {name: i for i, name in enumerate(classes.get(attribute, ()))}
-            unknown = sum(name not in place for name in names)
-            if unknown:
+            if unknown := sum(name not in place for name in names):
                 raise AuditError(
                     f"{unknown} of {len(names)} labels of {attribute} are no class of it"
                 )
             codes[attribute] = np.array([place[name] for name in names], dtype=np.int64)
-        return cls(descriptors, codes, {name: tuple(of) for name, of in classes.items()})
+        return cls(embeddings, codes, {name: tuple(of) for name, of in classes.items()})
 
-    def take(self, indices: NDArray[np.int64]) -> "LabelledFaces":
+    def take(self, indices: Codes) -> "LabelledFaces":
         """Return some of the faces, in the order of their positions."""
         labels = {name: codes[indices] for name, codes in self.labels.items()}
-        return LabelledFaces(self.descriptors[indices], labels, self.classes)
+        return LabelledFaces(self.embeddings[indices], labels, self.classes)
 
     def along(self, source: DecoySource) -> "LabelledFaces":
         """Take the embeddings to the coordinates that templates have."""
-        return LabelledFaces(source.project(self.descriptors), self.labels, self.classes)
+        return LabelledFaces(source.project(self.embeddings), self.labels, self.classes)
 
-    def names(self, attribute: str) -> list[str]:
-        """Return the class of every face."""
-        classes = self.classes[attribute]
-        return [classes[code] for code in self.labels[attribute].tolist()]
-
-    def decoy_attributes(self) -> list[Attributes]:
-        """Gender and race of every face, as hybrid+ needs them; None where they have no label."""
-        known = [
-            self.names(name) if name in self.classes else [None] * len(self)
+    def decoy_attributes(self) -> list[Attributes] | None:
+        """Gender and race of every face, as hybrid+ needs them; None without labels of both."""
+        if not {"gender", "race"} <= self.classes.keys():
+            return None
+        genders, races = (
+            [self.classes[name][code] for code in self.labels[name].tolist()]
             for name in ("gender", "race")
-        ]
-        return [Attributes(gender, race) for gender, race in zip(*known, strict=True)]
+        )
+        return [Attributes(gender, race) for gender, race in zip(genders, races, strict=True)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,15 +125,15 @@ def split(
     attacked_most: int | None,
     seed: int,
 ) -> Split:
-    """Deal out the parts as in paper §4.3.
+    """Deal out the parts at random, as in paper §4.3.
 
     Parameters
     ----------
     train
-        Labelled faces: ``lifting`` random ones become the lifting database (the paper: 10,000),
-        ``attack`` others the attacker's (:func:`attacker_faces`).
+        ``lifting`` of these become the lifting database (the paper: 10,000), and ``attack`` others
+        the attacker's.
     attacked_most
-        Attack at most so many validation faces, chosen at random; None for all.
+        Most validation faces that are attacked; None for all.
 
     Raises
     ------
@@ -162,22 +150,3 @@ def split(
         train.take(order[lifting : lifting + attack]),
         attacked.take(np.sort(victims)),
     )
-
-
-def attacker_faces(training: int, *, lifting: int, attack: int | None) -> int:
-    """Return how many of so many training faces are the attacker's: ``attack``, or all others.
-
-    Raises
-    ------
-    AuditError
-        There are too few training faces.
-    """
-    left = training - lifting
-    wanted = left if attack is None else attack
-    if lifting < 1 or wanted < 1 or wanted > left:
-        raise AuditError(
-            f"{lifting} lifting faces and {'the others' if attack is None else attack} for the "
-            f"attacker cannot be taken from {training} training faces: both must be 1 or more; "
-            "choose smaller sizes"
-        )
-    return wanted

@@ -1,7 +1,7 @@
 """What an attacker computes from a template, so that a classifier can learn from it.
 
 All of it is a function of the set 𝒟 alone: of the foot point p and of the projection DᵀD, never of
-the stored basis D, which is random. A template lifted from unit descriptors with k decoys is the
+the stored basis D, which is random. A template lifted from unit embeddings with k decoys is the
 affine hull of k + 1 faces; p is close to their mean, so a linear score of p is the mean of the
 faces' scores, and x DᵀD y measures how the scores x and y spread over them.
 """
@@ -51,7 +51,7 @@ class Axes:
         Linear discriminant analysis, Σ⁻¹(μ_c − μ) with the shrunk within-class covariance Σ, in
         float64: closed, so that equal faces give equal axes.
         """
-        x = faces.descriptors.astype(np.float64)
+        x = faces.embeddings.astype(np.float64)
         discriminants, prototypes = [], []
         for attribute, names in faces.classes.items():
             codes = faces.labels[attribute]
@@ -75,37 +75,6 @@ class Axes:
         )
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Features:
-    """Features of P templates.
-
-    Parameters
-    ----------
-    foot : (P, n) float32
-        Foot points; of raw descriptors, the descriptors.
-    derived : (P, f) float32
-        Everything else.
-    """
-
-    foot: Array32
-    derived: Array32
-
-    def __len__(self) -> int:
-        return len(self.foot)
-
-    def take(self, rows: Codes) -> "Features":
-        """Return some of the rows."""
-        return Features(self.foot[rows], self.derived[rows])
-
-    @classmethod
-    def stack(cls, parts: Sequence["Features"]) -> "Features":
-        """Put the rows of all parts under each other."""
-        return cls(
-            np.concatenate([part.foot for part in parts]),
-            np.concatenate([part.derived for part in parts]),
-        )
-
-
 def features_of(
     attacked: Attacked,
     axes: Axes,
@@ -113,8 +82,8 @@ def features_of(
     gallery: LabelledFaces,
     *,
     ks: Sequence[int],
-) -> Features:
-    """Compute the features of templates, or of raw descriptors.
+) -> Array32:
+    """Compute the features (P, f) float32 of templates, or of raw embeddings.
 
     Parameters
     ----------
@@ -126,23 +95,21 @@ def features_of(
     gallery
         Labelled faces that are in none of these templates.
 
-    Returns
-    -------
-    Features
-        Derived are, for discriminants w and prototypes μ: w·p, and wᵢ DᵀD wⱼ for every pair; ‖p‖;
-        the similarity of the set to every prototype, p·μ + s‖Dμ‖, and s‖Dw‖; the shares of the
-        classes among the neighbours, by metric, attribute and K. Of a raw descriptor, which has no
-        D, those that are left.
+    Notes
+    -----
+    For discriminants w and prototypes μ: w·p, and wᵢ DᵀD wⱼ for every pair; ‖p‖; the similarity of
+    the set to every prototype, p·μ + s‖Dμ‖, and s‖Dw‖; the shares of the classes among the
+    neighbours, by metric, attribute and K. Of a raw embedding, which has no D, those that are left.
     """
     shares = [
-        votes(neighbours_found, gallery.labels[attribute], len(names), k=k)
-        for neighbours_found in neighbours.values()
+        votes(near, gallery.labels[attribute], len(names), k=k)
+        for near in neighbours.values()
         for attribute, names in gallery.classes.items()
         for k in ks
     ]
     if not isinstance(attacked, SubspaceBatch):
         parts = [attacked @ axes.discriminants.T, attacked @ axes.prototypes.T]
-        return Features(attacked, np.hstack([*parts, *shares]).astype(np.float32))
+        return np.hstack([*parts, *shares]).astype(np.float32)
     feet, radii = attacked.feet, attacked.radii[:, None]
     spread = _inside(attacked, axes.discriminants)
     moments = spread.transpose(0, 2, 1) @ spread
@@ -155,7 +122,7 @@ def features_of(
         feet @ axes.prototypes.T + radii * widths,
         radii * np.linalg.norm(spread, axis=1),
     ]
-    return Features(feet, np.hstack([*parts, *shares]).astype(np.float32))
+    return np.hstack([*parts, *shares]).astype(np.float32)
 
 
 def _inside(templates: SubspaceBatch, rows: Array32) -> Array32:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from attacks.attributes.features import Axes, Features, features_of
+from attacks.attributes.features import Axes, features_of
 from attacks.attributes.neighbours import nearest_neighbours
 from templates.decoys import DecoyPool
 from templates.keys.randomness import Keystream
@@ -13,16 +13,16 @@ from tests.attacks.attributes.people import faces
 GALLERY, VICTIMS, DECOYS = faces(200, seed=1), faces(12, seed=2), faces(40, seed=3)
 AXES = Axes.fit(GALLERY)
 TEMPLATES = lift(
-    VICTIMS.descriptors,
+    VICTIMS.embeddings,
     strategy="hybrid",
     m=4,
-    source=DecoyPool(DECOYS.descriptors),
+    source=DecoyPool(DECOYS.embeddings),
     stream=Keystream.seeded("features"),
 )
 
 
-def features(templates: SubspaceBatch) -> Features:
-    near = nearest_neighbours(templates, GALLERY.descriptors, k=20)
+def features(templates: SubspaceBatch) -> np.ndarray:
+    near = nearest_neighbours(templates, GALLERY.embeddings, k=20)
     return features_of(templates, AXES, near, GALLERY, ks=(5, 20))
 
 
@@ -31,15 +31,14 @@ def test_another_basis_of_the_same_sets_gives_the_same_features() -> None:
     turned = SubspaceBatch(TEMPLATES.feet, (turns @ TEMPLATES.bases).astype(np.float32))
     assert np.abs(turned.bases - TEMPLATES.bases).max() > 0.1
     here, there = features(TEMPLATES), features(turned)
-    np.testing.assert_allclose(here.derived, there.derived, atol=1e-5)
-    np.testing.assert_array_equal(here.foot, there.foot)
+    np.testing.assert_allclose(here, there, atol=1e-5)
 
 
 def test_features_agree_with_their_formulas() -> None:
-    found = features(TEMPLATES).derived
+    rows = features(TEMPLATES)
     w, mu = AXES.discriminants.astype(np.float64), AXES.prototypes.astype(np.float64)
     assert (len(w), len(mu)) == (1 + 3, 2 + 3)
-    for row, template in zip(found, TEMPLATES, strict=True):
+    for row, template in zip(rows, TEMPLATES, strict=True):
         p, basis = template.foot.astype(np.float64), template.basis.astype(np.float64)
         projection = basis.T @ basis
         moments = w @ projection @ w.T
@@ -63,7 +62,7 @@ def test_discriminants_are_those_of_scikit_learn() -> None:
 
     many = faces(4000, seed=4, n=16)
     own = Axes.fit(many).discriminants[0]
-    theirs = LinearDiscriminantAnalysis(solver="lsqr").fit(many.descriptors, many.labels["gender"])
+    theirs = LinearDiscriminantAnalysis(solver="lsqr").fit(many.embeddings, many.labels["gender"])
     axis = theirs.coef_[0] / np.linalg.norm(theirs.coef_[0])
     # Ours is shrunk a little.
     assert own @ axis > 0.99
@@ -76,9 +75,8 @@ def test_a_class_without_a_face_gives_finite_axes() -> None:
     assert np.isfinite(axes.prototypes).all()
 
 
-def test_raw_descriptors_have_the_scores_and_votes() -> None:
-    raw = VICTIMS.descriptors
-    near = nearest_neighbours(raw, GALLERY.descriptors, k=20)
-    found = features_of(raw, AXES, near, GALLERY, ks=(5,))
-    np.testing.assert_array_equal(found.foot, raw)
-    np.testing.assert_allclose(found.derived[:, :4], raw @ AXES.discriminants.T, atol=1e-6)
+def test_raw_embeddings_have_the_scores_and_votes() -> None:
+    raw = VICTIMS.embeddings
+    near = nearest_neighbours(raw, GALLERY.embeddings, k=20)
+    rows = features_of(raw, AXES, near, GALLERY, ks=(5,))
+    np.testing.assert_allclose(rows[:, :4], raw @ AXES.discriminants.T, atol=1e-6)

@@ -1,18 +1,18 @@
-"""Whoever holds the pool finds the decoys, removes them, and reads what was left out."""
+"""An attacker with the pool finds the decoys, removes them, and reads what is left."""
 
 import numpy as np
 import pytest
 
-from attacks.attributes.known_decoys import TOUCH, find_decoys, strip
+from attacks.stored.known_pool import TOUCH, find_decoys, strip
 from templates.decoys import DecoyPool
 from templates.keys.randomness import Keystream
 from templates.space.lifting import lift
 from templates.space.subspace import SubspaceBatch
 from tests.attacks.attributes.people import faces
 
-POOL = DecoyPool(faces(150, seed=1, n=256).descriptors)
+POOL = DecoyPool(faces(150, seed=1, n=256).embeddings)
 ENTRIES = POOL.entries[0]
-VICTIMS = faces(30, seed=2, n=256).descriptors
+VICTIMS = faces(30, seed=2, n=256).embeddings
 
 
 class Watched:
@@ -48,15 +48,15 @@ def test_finds_all_decoys_and_no_other(strategy: str, m: int, half: bool) -> Non
         feet, bases = (part.astype(np.float16) for part in (templates.feet, templates.bases))
         templates = SubspaceBatch(feet.astype(np.float32), bases.astype(np.float32))
     # Asked for more than there are, it finds only what is there.
-    found = find_decoys(templates, ENTRIES, most=7)
-    assert found.found.sum(axis=1).tolist() == [4] * 30
+    decoys = find_decoys(templates, ENTRIES, most=7)
+    assert decoys.inside.sum(axis=1).tolist() == [4] * 30
     for row in range(30):
-        mine = {entry.tobytes() for entry in ENTRIES[found.entries[row][found.found[row]]]}
+        mine = {entry.tobytes() for entry in ENTRIES[decoys.entries[row][decoys.inside[row]]]}
         assert mine == {decoy.tobytes() for decoy in drawn[row]}
 
 
 @pytest.mark.parametrize(("strategy", "m"), [("adversarial", 4), ("hybrid", 8)])
-def test_what_is_left_is_the_descriptors_own_part(strategy: str, m: int) -> None:
+def test_what_is_left_is_the_embeddings_own_part(strategy: str, m: int) -> None:
     templates, drawn = lifted(strategy, m)
     rest = strip(templates, ENTRIES, find_decoys(templates, ENTRIES, most=4))
     for row in range(30):
@@ -73,20 +73,20 @@ def test_what_is_left_is_the_descriptors_own_part(strategy: str, m: int) -> None
 
 def test_another_pool_finds_nothing_and_leaves_the_foot_point() -> None:
     templates, _ = lifted("adversarial", 4)
-    other = faces(150, seed=9, n=256).descriptors
-    found = find_decoys(templates, other, most=4)
-    assert not found.found.any()
+    other = faces(150, seed=9, n=256).embeddings
+    decoys = find_decoys(templates, other, most=4)
+    assert not decoys.inside.any()
     feet = templates.feet / np.linalg.norm(templates.feet, axis=1, keepdims=True)
-    np.testing.assert_allclose(strip(templates, other, found), feet, atol=1e-6)
+    np.testing.assert_allclose(strip(templates, other, decoys), feet, atol=1e-6)
 
 
 def test_the_face_itself_is_no_decoy() -> None:
     templates, _ = lifted("adversarial", 4)
     pool = np.vstack([ENTRIES, VICTIMS])
     own = 150 + np.arange(30)
-    found = find_decoys(templates, pool, most=4, skip=own)
-    assert found.found.all()
-    assert not (found.entries == own[:, None]).any()
+    decoys = find_decoys(templates, pool, most=4, own=own)
+    assert decoys.inside.all()
+    assert not (decoys.entries == own[:, None]).any()
 
 
 def test_the_threshold_is_far_from_both_sides() -> None:
