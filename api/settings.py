@@ -111,10 +111,10 @@ class Settings(BaseSettings):
         description="The contract that `veilface calibrate` wrote. Unset: `contract.json` in "
         "`data_dir`.",
     )
-    accept_weak_privacy: bool = Field(
+    require_private: bool = Field(
         False,
-        description="Serve a contract whose privacy failed its limit, or was not measured. The "
-        "log and the page say so.",
+        description="Refuse to start with a contract whose privacy is not proven: its verdict is "
+        "not PASS. Otherwise the log and the page say so.",
     )
     decoys_file: Path | None = Field(
         None,

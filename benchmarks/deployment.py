@@ -20,7 +20,6 @@ from sqlalchemy.engine import make_url
 from tests.serving import serve
 
 UNLIMITED = {
-    "VEILFACE_ACCEPT_WEAK_PRIVACY": "true",
     "VEILFACE_LOCKOUT_AFTER": "0",
     "VEILFACE_RATE_LIMIT_KEY": "off",
     "VEILFACE_RATE_LIMIT_ADDRESS": "off",

@@ -231,7 +231,6 @@ def exercise(material: Material, folder: Path, *, database_url: str) -> ServiceT
         "VEILFACE_DATA_DIR": str(folder / "data"),
         "VEILFACE_DATABASE_URL": database_url,
         "VEILFACE_PACK": str(material.pack_dir),
-        "VEILFACE_ACCEPT_WEAK_PRIVACY": "true",
         "VEILFACE_LOG_LEVEL": "debug",
         "VEILFACE_MAX_REQUEST_BYTES": str(3 * 1024 * 1024),
     }

@@ -29,6 +29,8 @@ CALIBRATED_FACES = 2_400
 most. Decoys are fitted to the others."""
 LEAST_PEOPLE = 80
 """With three photos each or more: as many resolve a false match rate of 1 in 1,000."""
+FEWEST_PEOPLE = 25
+"""With three photos each or more: as many resolve a false match rate of 1 in 100."""
 
 Albums = Mapping[str, Sequence[Path]]
 T = TypeVar("T")
@@ -63,11 +65,15 @@ class Roles:
 
 
 def assign_roles(
-    labelled: LabelledFolder | None, faces: Sequence[Path], like: Sequence[Path]
+    labelled: LabelledFolder | None,
+    faces: Sequence[Path],
+    like: Sequence[Path],
+    *,
+    apart: LabelledFolder | None = None,
 ) -> Roles:
     """Give every photo one role; people are told apart by the names of their folders.
 
-    Without ``labelled`` each of the faces is a person of its own.
+    Without ``labelled`` each of the faces is a person of its own; nobody of ``apart`` is taken.
 
     Raises
     ------
@@ -75,10 +81,17 @@ def assign_roles(
         No face is left to fit decoys to, or no photo of ``like``.
     """
     if labelled is None:
-        kept, calibration = split_faces(photos_of(faces, frozenset())[0])
-        if not kept:
-            raise CommandError("--faces has too few photos to fit decoys to")
-        return Roles(kept, (), calibration)
+        aside = frozenset() if apart is None else frozenset(apart.identities)
+        others, left_out = photos_of(faces, aside)
+        taken = frozenset() if apart is None else {path.resolve() for path in apart.paths}
+        kept, calibration = split_faces([path for path in others if path.resolve() not in taken])
+        if len(kept) < MIN_DESCRIPTORS:
+            raise CommandError(
+                f"--faces has {len(others)} photos: half of them set the thresholds, and decoys "
+                f"are fitted to the other half, which takes {MIN_DESCRIPTORS}: give "
+                f"{2 * MIN_DESCRIPTORS} or more, better 5,000"
+            )
+        return Roles(kept, (), calibration, left_out)
     albums: dict[str, list[Path]] = {}
     for path, name in zip(labelled.paths, labelled.identities, strict=True):
         albums.setdefault(name, []).append(path)
@@ -179,6 +192,15 @@ def resolved_rates(albums: Albums) -> list[float]:
     ]
 
 
+def too_few(albums: Albums) -> str:
+    """Say that so few people set no threshold, and how many would."""
+    return (
+        f"{len(albums)} people with {sum(map(len, albums.values()))} photos are too few to set a "
+        f"threshold by: {FEWEST_PEOPLE} resolve that 1 stranger in 100 is accepted, and "
+        f"{LEAST_PEOPLE} that 1 in 1,000 is"
+    )
+
+
 def promises(roles: Roles, *, n: int) -> tuple[list[str], list[str]]:
     """Say what can and what cannot be promised with so many photos, in sentences.
 
@@ -195,8 +217,8 @@ def promises(roles: Roles, *, n: int) -> tuple[list[str], list[str]]:
         can.append(f"thresholds for false match rates of {levels}")
     else:
         cannot.append(
-            f"any false match rate: {len(people)} people are too few, and {LEAST_PEOPLE} resolve 1 "
-            "in 1,000"
+            f"any false match rate: {len(people)} people are too few, {FEWEST_PEOPLE} resolve 1 in "
+            f"100, and {LEAST_PEOPLE} 1 in 1,000"
         )
     if not with_several(people):
         cannot.append("how many genuine photos are rejected: nobody is labelled with two photos")

@@ -83,8 +83,7 @@ def _check(settings: Settings) -> Contract:
     try:
         for line in verdict_lines(runtime.contract.verdict):
             message(line)
-        if (weakness := require_privacy(runtime.contract, settings)) is not None:
-            message(f"warning: weak privacy is accepted: {weakness}")
+        require_privacy(runtime.contract, settings)
         browsers_lift = settings.serve_pack and isinstance(runtime.source, DecoyGenerator)
         if browsers_lift and (weakness := private_mode_weakness(runtime.contract)) is not None:
             message(f"warning: private mode: {weakness}")

@@ -25,10 +25,10 @@ from api.cli.master_keys import is_from_file, opened_store
 from api.cli.options import AsJson, takes_settings
 from api.cli.photo_folders import find_photos, labelled_people
 from api.cli.results import Result, present
-from api.cli.roles import Roles, assign_roles, promises, resolved_rates, with_several
-from api.cli.verdict import verdict_lines
+from api.cli.roles import Roles, assign_roles, promises, resolved_rates, too_few, with_several
+from api.cli.verdict import plain_lines
 from api.http.audit import operator
-from api.service.opening import file_sealer, open_contract, open_keyring, weak_privacy
+from api.service.opening import file_sealer, open_contract, open_keyring
 from api.service.settings_file import settings_text
 from api.settings import DEFAULT_CONFIG_FILE, Settings, config_file, load_settings
 from models.extraction import Extraction
@@ -45,11 +45,12 @@ from verify.evaluation.attributes import resembling_rows
 from verify.own_decoys import SAME_PHOTO
 from verify.preparation import acquired, make_generator
 
-RIGHTS = (Right.ENROLL, Right.VERIFY, Right.ERASE)
+RIGHTS = (Right.ENROLL, Right.VERIFY, Right.ERASE, Right.SCORES, Right.ADMIN)
+"""Of the key that is made: all that the page shows, with distances, locks and the audit log."""
 HEADER = "Written by `veilface setup`; docs/settings.md has the rest."
 
 
-@takes_settings("pack", "providers", "data_dir", "master_key_file", "accept_weak_privacy")
+@takes_settings("pack", "providers", "data_dir", "master_key_file")
 def setup(
     people: Annotated[
         Path | None,
@@ -95,9 +96,10 @@ def setup(
     Makes the master key apart from the data, splits the people by the names of their folders so
     that no name is in two roles, builds the decoys, calibrates, makes an API key, and writes
     `veilface.toml`, which `veilface serve` reads. What is there already is kept: a run that was
-    stopped goes on when it is started again. Exit status 1: there is no threshold; the templates
-    are not private, and `serve` will refuse them without --accept-weak-privacy; or a settings
-    file that is there has `serve` start another service.
+    stopped goes on when it is started again. It ends with two lines on privacy and accuracy; the
+    service starts whatever they say. PEOPLE too few for any threshold are left aside, and
+    thresholds are set on --faces. Exit status 1: --faces are too few as well; or a settings file
+    that is there has `serve` start another service.
 
     Example: `veilface setup --faces fairface/train --pack buffalo_l`
     """
@@ -106,12 +108,18 @@ def setup(
         raise UsageError("--like adapts the decoys to people like those of PEOPLE: give PEOPLE too")
     labelled = None if people is None else _labelled(people)
     roles = assign_roles(labelled, faces, like or [])
+    if labelled is not None and not resolved_rates(roles.calibration):
+        message(f"note: {too_few(roles.calibration)}: thresholds are set on --faces instead")
+        if like:
+            raise UsageError(
+                "--like adapts the decoys to people like those of PEOPLE, and PEOPLE are too few "
+                "to judge them by: give more PEOPLE, or leave out --like"
+            )
+        roles, labelled = assign_roles(None, faces, [], apart=labelled), None
     plan = _plan(roles, pack, settings, labelled=labelled is not None)
     nothing = None
     if not resolved_rates(roles.calibration):
-        nothing = (
-            f"there is nothing to serve: {people or faces[0]} resolves no rate of false matches"
-        )
+        nothing = f"there is nothing to serve: {too_few(roles.calibration)}; give more --faces"
     if dry_run or nothing or not as_json:
         present(Result(plan, _plan_text(plan), error=nothing), json=as_json)
     if dry_run:
@@ -129,34 +137,23 @@ def setup(
     )  # fmt: skip
     cache.unlink(missing_ok=True)
     _keep_api_key(settings, keyring, steps)
-    weakness = None if settings.accept_weak_privacy else weak_privacy(contract)
-    if weakness is not None:
-        error: str | None = (
-            f"`veilface serve` refuses this contract: {weakness}. Remove it and the decoys, and "
-            "set up again with more photos; or accept it knowingly: run this again with "
-            "--accept-weak-privacy"
-        )
-    else:
-        error = _write_settings(settings, steps)
+    error = _write_settings(settings, steps)
     notice = demo_notice(pack.info.embedder_sha256, n=pack.info.n)
     facts = {
         **plan,
         "steps": steps,
         "verdict": contract.verdict,
-        "servable": weakness is None,
         **notice,
     }
     key_file = api_key_file(settings)
-    text = [
-        *verdict_lines(contract.verdict)[:2],
-        f"API key with the rights {', '.join(sorted(RIGHTS))}: {key_file}",
-    ]
+    text = [f"API key with the rights {', '.join(sorted(RIGHTS))}: {key_file}"]
     if error is None:
         # Imported here: a server takes long to load.
         from api.cli.serve import service_url
 
         text += [] if serve else ["Start it: veilface serve"]
         text += _calls(service_url(settings), key_file)
+    text += plain_lines(contract.verdict)
     present(Result(facts, text, error=error), json=as_json)
     if serve:
         # Anew: this process has run the models, and what accelerators have begun outlives no fork.
@@ -239,8 +236,8 @@ def _calls(service: str, key_file: Path) -> list[str]:
     return [
         f"Page:     open {service}/ and sign in with the key in {key_file}",
         f"Enroll:   curl -X PUT {person}/enrollment {key} -F images=@anna1.jpg "
-        "-F images=@anna2.jpg",
-        f"Verify:   curl -X POST {person}/verify {key} -F image=@anna3.jpg",
+        "-F images=@anna2.jpg -F images=@anna3.jpg",
+        f"Verify:   curl -X POST {person}/verify {key} -F images=@anna4.jpg -F images=@anna5.jpg",
     ]
 
 
@@ -307,8 +304,9 @@ def _prepared(
             options=CalibrationOptions(probe_dims=(0, *default_probe_dims(None))),
             progress=lambda _what, share: report(share),
         )
-    for line in suspicious_lines(done.report, "put the photos of one person into one folder"):
-        message(line)
+    if labelled is not None:
+        for line in suspicious_lines(done.report, "put the photos of one person into one folder"):
+            message(line)
     if isinstance(source, DecoyGenerator) and not decoys_kept:
         source.save(decoys)
     done.contract.save(path, sealer)
@@ -379,7 +377,6 @@ def _write_settings(settings: Settings, steps: dict[str, str]) -> str | None:
     """
     names = ["data_dir", "pack"]
     names += ["master_key_file"] if settings.master_key_file is not None else []
-    names += ["accept_weak_privacy"] if settings.accept_weak_privacy else []
     if settings.providers != Settings.model_fields["providers"].default:
         names.append("providers")
     text = settings_text({name: getattr(settings, name) for name in names}, HEADER)

@@ -130,7 +130,7 @@ def enroll(
             by=operator(),
         )
         if (weakness := weak_privacy(runtime.contract)) is not None:
-            message(f"warning: weak privacy: {weakness}")
+            message(f"note: privacy is not proven: {weakness}")
     notice = demo_notice(pack.info.embedder_sha256, n=pack.info.n)
     done = "Enrolled" if stored.created else "Replaced the enrollment of"
     return Result(

@@ -73,6 +73,83 @@ def _groups_line(groups: Judgement | None) -> str:
     )
 
 
+LIKE_PHOTOS, LIKE_OPENED = 600, (136, 3_600)
+"""Photos of people like those enrolled, and templates that were opened and attacked where decoys
+had been adapted to so many or more: docs/results/privacy.md, 26 November 2026."""
+
+
+def plain_lines(verdict: Verdict | None) -> tuple[str, str]:
+    """Say to somebody who knows no biometrics how private and how accurate a contract is.
+
+    Every figure is the verdict's own, but what more photos would bring, which is named as measured
+    elsewhere.
+    """
+    if verdict is None:
+        return (
+            "Privacy: not proven: nobody measured it. `veilface calibrate` does.",
+            "Accuracy: not measured.",
+        )
+    return _plain_privacy(verdict.privacy), _plain_accuracy(verdict.accuracy)
+
+
+def _plain_privacy(privacy: Judgement) -> str:
+    opened, proven = privacy.rate, privacy.status == "PASS"
+    said = "proven, against every attack that we know" if proven else "not proven"
+    if privacy.shortfall is not None:
+        text = f"{said}: {privacy.shortfall}."
+    elif not opened.errors:
+        text = (
+            f"{said}. If the database and the master key are both stolen, none of the "
+            f"{opened.trials} people attacked could be recognised elsewhere."
+        )
+    else:
+        text = (
+            f"{said}. If the database and the master key are both stolen, about "
+            f"{_one_in(opened, 'person', 'people')} could be recognised elsewhere "
+            f"({opened.errors} of {opened.trials})."
+        )
+    if proven:
+        return f"Privacy: {text}"
+    errors, trials = LIKE_OPENED
+    if privacy.shortfall is not None or opened.value > errors / trials:
+        text += (
+            f" With {LIKE_PHOTOS} photos or more of people like yours (PEOPLE, --like) it was "
+            f"about 1 in {trials / errors:.0f} where that was measured: on LFW, 26 November 2026 "
+            "(docs/results/privacy.md)."
+        )
+    return f"Privacy: {text}"
+
+
+def _plain_accuracy(accuracy: Judgement | None) -> str:
+    if accuracy is None:
+        return (
+            "Accuracy: not measured: nobody is labelled with two photos. For that, give a folder "
+            "with a subfolder of three photos for each of 80 people: `veilface setup PEOPLE …`."
+        )
+    enrolled, shown = (
+        _IN_WORDS.get(str(accuracy.basis[name]), str(accuracy.basis[name]))
+        for name in ("enrolled_photos", "probe_photos")
+    )
+    rejected = accuracy.rate
+    if rejected.errors:
+        share = f"{_one_in(rejected, 'genuine attempt', 'genuine attempts')} is rejected"
+        share += f" ({rejected.errors} of {rejected.trials})"
+    else:
+        share = f"none of {rejected.trials:,} genuine attempts is rejected"
+    few = "" if accuracy.shortfall is None else f" Few were measured: {accuracy.shortfall}."
+    return f"Accuracy: {share}, with {enrolled} photos enrolled and {shown} shown.{few}"
+
+
+_IN_WORDS = {"1": "one", "2": "two", "3": "three", "None": "all"}
+
+
+def _one_in(rate: Rate, one: str, several: str) -> str:
+    """Write a rate that is not zero as ``1 person in 14``, or as ``9 in 10 people`` if large."""
+    if rate.value > 0.4:
+        return f"{max(1, round(10 * rate.value))} in 10 {several}"
+    return f"1 {one} in {1 / rate.value:,.0f}"
+
+
 def private_mode_weakness(contract: Contract) -> str | None:
     """Say that too many single photos are rejected where browsers lift them, or None.
 

@@ -27,7 +27,7 @@ from api.demo.service import running_service
 from api.demo.storage import KEY_FILE, Stored, create_key, read_stored, rows_of
 from api.http.errors import StartError
 from api.http.receipts import read_receipt_key, verify_answer
-from api.service.opening import file_sealer, weak_privacy
+from api.service.opening import file_sealer
 from api.service.settings_file import settings_text
 from models.demo import build_demo_pack, is_demo_model
 from models.extraction import Extraction, Extractor
@@ -136,7 +136,7 @@ def run_demo(
         else:
             cast, decoy_photos, labelled = found_cast(faces, size)
         contract = _calibrate(folder, pack, decoy_photos, labelled, m=m, say=say)
-    _write_settings(folder, pack, contract)
+    _write_settings(folder, pack)
     say("starting the service")
     with running_service(folder, create_key(folder)) as client:
         return _play(client, folder, pack, contract, cast, say=say, started=started)
@@ -213,7 +213,7 @@ def _extract(pack: ModelPack, photos: Sequence[Path]) -> Extraction:
     return extraction
 
 
-def _write_settings(folder: Path, pack: Path, contract: Contract) -> None:
+def _write_settings(folder: Path, pack: Path) -> None:
     values: dict[str, Path | bool] = {
         "data_dir": folder,
         "master_key_file": folder / KEY_FILE,
@@ -225,11 +225,6 @@ def _write_settings(folder: Path, pack: Path, contract: Contract) -> None:
     ]
     if is_demo_model(ModelPack.load(pack, threads=1).info.embedder_sha256):
         values["demo"] = True
-    if weak_privacy(contract) is not None:
-        comments.append(
-            "So few people give no decoys that conceal a face; a deployment must not accept it."
-        )
-        values["accept_weak_privacy"] = True
     text = settings_text(values, *comments)
     (folder / "veilface.toml").write_text(text, encoding="utf-8")
 

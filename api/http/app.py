@@ -226,7 +226,7 @@ async def _open(
     )
     if (weakness := require_privacy(runtime.contract, settings)) is not None:
         log(
-            "weak privacy is accepted: " + weakness,
+            "privacy is not proven: " + weakness,
             severity=logging.WARNING,
             contract_id=runtime.contract.contract_id,
         )

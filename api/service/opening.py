@@ -239,19 +239,18 @@ def weak_privacy(contract: Contract) -> str | None:
 
 
 def require_privacy(contract: Contract, settings: Settings) -> str | None:
-    """Refuse a contract that is not private, or return what to warn of where that is accepted.
+    """Return why privacy is not proven, or None; refuse the contract where the settings say so.
 
     Raises
     ------
     StartError
-        Its privacy failed or was not measured, and ``accept_weak_privacy`` is not set.
+        Privacy is not proven, and ``require_private`` is set.
     """
     why = weak_privacy(contract)
-    if why is not None and not settings.accept_weak_privacy:
+    if why is not None and settings.require_private:
         raise StartError(
-            f"the contract fails on privacy: {why}. Build decoys that are like your people "
-            "(`veilface decoys build --like`) and calibrate again; or serve it knowingly with "
-            "--accept-weak-privacy"
+            f"privacy is not proven, and require_private asks for it: {why}. Build decoys that are "
+            "like your people (`veilface decoys build --like`) and calibrate again"
         )
     return why
 

@@ -1,4 +1,4 @@
-// Log people in by their face: POST /NAME with a photo as the body. Node 18 or newer, no packages.
+// Log people in by their face: POST /NAME with a form of up to five `images`. Node 18 or newer, no packages.
 import { randomUUID } from "node:crypto";
 import { createServer } from "node:http";
 import { buffer } from "node:stream/consumers";
@@ -6,25 +6,40 @@ import { buffer } from "node:stream/consumers";
 const { VEILFACE_URL, VEILFACE_API_KEY, PORT = "3000" } = process.env;
 const sessions = new Map(); // session to name; yours live in a database
 
-async function login(name, photo) {
+// The photos alone are sent on: a form must not choose how strictly it is judged.
+async function photosOf(request) {
+  const headers = { "Content-Type": request.headers["content-type"] ?? "" };
+  const form = await new Response(await buffer(request), { headers }).formData();
+  return form.getAll("images").filter((photo) => photo instanceof Blob);
+}
+
+async function login(name, photos) {
   const body = new FormData();
-  body.append("image", new Blob([await buffer(photo)]));
+  for (const photo of photos) body.append("images", photo);
   const headers = { Authorization: `Bearer ${VEILFACE_API_KEY}` };
   const path = `${VEILFACE_URL}/v1/subjects/${name}/verify`;
   const signal = AbortSignal.timeout(30_000);
   const answer = await fetch(path, { method: "POST", body, headers, redirect: "error", signal });
   const { decision, error } = await answer.json();
   if ([401, 403].includes(answer.status)) throw new Error(error.message); // our key, not their face
-  if (!answer.ok) return [answer.status, error.message]; // no face in the photo, locked out …
-  return decision === "accept" ? [204] : [401, "this is somebody else"];
+  if (answer.status === 423) return [423, locked(error, Number(answer.headers.get("Retry-After")))];
+  if (!answer.ok) return [answer.status, error.message]; // no face in the photo, too many requests …
+  return decision === "accept" ? [204] : [401, "not recognised, try again"];
+}
+
+function locked({ details }, seconds) {
+  const until = new Date(Date.now() + 1000 * seconds).toLocaleTimeString("en-GB");
+  const end = details.disabled ? "until an administrator lifts it" : `until ${until}; an administrator can lift it`;
+  return `too many attempts: locked ${end}`;
 }
 
 createServer(async (request, response) => {
   const [, name] = /^\/([\w.@:-]{1,128})$/.exec(request.url) ?? [];
-  const fits = name && Number(request.headers["content-length"]) <= 10_000_000;
-  const [status, text] = fits
-    ? await login(name, request).catch(() => [502, "use your password"])
-    : [400, "send a photo of at most 10 MB to /NAME"];
+  const fits = name && Number(request.headers["content-length"]) <= 20_000_000;
+  const photos = fits ? await photosOf(request).catch(() => []) : [];
+  const [status, text] = photos.length
+    ? await login(name, photos).catch(() => [502, "use your password"])
+    : [400, "send a form with one to five `images`, of 20 MB together, to /NAME"];
   if (status === 204) {
     const session = randomUUID();
     sessions.set(session, name);

@@ -1,26 +1,49 @@
-"""Log people in by their face: POST /NAME with a photo as the body. Needs veilface-client."""
+"""Log people in by their face: POST /NAME with a form of `images`. Needs veilface-client."""
 
 import os
 import secrets
+from datetime import datetime, timedelta
+from email import message_from_bytes
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
-from veilface_client import Client, Forbidden, ServiceError, Unauthorized, VeilfaceError
+from veilface_client import Client, Forbidden, LockedOut, ServiceError, Unauthorized, VeilfaceError
 
 CLIENT = Client(os.environ["VEILFACE_URL"], os.environ["VEILFACE_API_KEY"])
 SESSIONS: dict[str, str] = {}  # session to name; yours live in a database
 
 
-def login(name: str, photo: bytes) -> tuple[int, str]:
+def photos_of(content_type: str, body: bytes) -> list[bytes]:
+    """Take the photos of a form, and nothing else: it must not choose how it is judged."""
+    form = message_from_bytes(f"Content-Type: {content_type}\r\n\r\n".encode() + body)
+    return [
+        photo
+        for part in form.walk()
+        if part.get_param("name", header="Content-Disposition") == "images"
+        and isinstance(photo := part.get_payload(decode=True), bytes)
+    ]
+
+
+def login(name: str, photos: list[bytes]) -> tuple[int, str]:
     """Return the status of an attempt, and what to tell."""
     try:
-        accepted = bool(CLIENT.verify(name, photo))
+        accepted = bool(CLIENT.verify(name, photos))
     except (Unauthorized, Forbidden):  # our key, not their face
         return 502, "use your password"
-    except ServiceError as error:  # no face in the photo, locked out …
+    except LockedOut as error:
+        return error.status, f"too many attempts: locked {lifted(error)}"
+    except ServiceError as error:  # no face in the photo, too many requests …
         return error.status, error.message
     except (VeilfaceError, ValueError):
         return 502, "use your password"
-    return (204, "") if accepted else (401, "this is somebody else")
+    return (204, "") if accepted else (401, "not recognised, try again")
+
+
+def lifted(error: LockedOut) -> str:
+    """Say until when, and who can end it."""
+    if error.details.get("disabled"):
+        return "until an administrator lifts it"
+    until = datetime.now() + timedelta(seconds=error.retry_after or 0)
+    return f"until {until:%H:%M:%S}; an administrator can lift it"
 
 
 class Login(BaseHTTPRequestHandler):
@@ -29,10 +52,11 @@ class Login(BaseHTTPRequestHandler):
     def do_POST(self) -> None:
         """Log in."""
         size, name = int(self.headers.get("Content-Length", 0)), self.path[1:]
-        if 0 < size <= 10_000_000:
-            status, text = login(name, self.rfile.read(size))
+        body = self.rfile.read(size) if 0 < size <= 20_000_000 else b""
+        if photos := photos_of(self.headers.get("Content-Type", ""), body):
+            status, text = login(name, photos)
         else:
-            status, text = 400, "send a photo of at most 10 MB to /NAME"
+            status, text = 400, "send a form with one to five `images`, of 20 MB together, to /NAME"
         self.send_response(status)
         if status == 204:
             SESSIONS[session := secrets.token_urlsafe(24)] = name

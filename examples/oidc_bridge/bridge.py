@@ -32,7 +32,8 @@ from veilface_client import AsyncClient, Forbidden, ServiceError, Unauthorized, 
 ISSUER = os.environ["ISSUER"]
 CLIENTS: dict[str, dict[str, str]] = json.loads(os.environ["CLIENTS"])
 KEY = load_pem_private_key(Path(os.environ["SIGNING_KEY"]).read_bytes(), None)
-MOST_BYTES = 10_000_000
+MOST_BYTES = 20_000_000
+MOST_PHOTOS = 5
 LOGIN_S, CODE_S, TOKEN_S = 600, 60, 300
 MOST_WAITING, MOST_COOKIE = 10_000, 3500
 SECRET = secrets.token_bytes(32)
@@ -116,8 +117,9 @@ def page(told: str, status: int = 200, asked: Asked | None = None) -> HTMLRespon
     """Return the login form, or a page that only tells something."""
     form = (
         '<form method="post" action="login" enctype="multipart/form-data"><p><label>Name <input '
-        'name="name" required autocomplete="username"></label><p><label>Photo <input name="photo" '
-        'type="file" accept="image/*" capture="user" required></label><p><button>Log in</button>'
+        'name="name" required autocomplete="username"></label><p><label>One to five photos, better '
+        'three <input name="images" type="file" accept="image/*" multiple required></label><p>'
+        "<button>Log in</button>"
         "</form>"
     )
     # Browsers hold the redirect that answers the form to this policy too.
@@ -142,7 +144,7 @@ async def bounded(request: Request, answer: RequestResponseEndpoint) -> Response
     """Refuse a body that is too large, or does not say how large it is, before it is read."""
     size = request.headers.get("Content-Length", "")
     if request.method == "POST" and not (size.isdecimal() and int(size) <= MOST_BYTES):
-        return page("Send a photo of at most 10 MB.", 413)
+        return page("Send photos of at most 20 MB together.", 413)
     return await answer(request)
 
 
@@ -213,16 +215,17 @@ async def login(request: Request) -> Response:
     asked = None if claims is None else Asked(**claims)
     if asked is None or asked.number in used:
         return page("This login has expired. Start again in the application.", 400)
-    async with request.form(max_files=1, max_fields=1) as form:
-        name, photo = form.get("name"), form.get("photo")
-        if not isinstance(name, str) or not isinstance(photo, UploadFile):
+    async with request.form(max_files=MOST_PHOTOS, max_fields=1) as form:
+        name = form.get("name")
+        files = [file for file in form.getlist("images") if isinstance(file, UploadFile)]
+        if not isinstance(name, str) or not files:
             return page("Give a name and a photo.", 400, asked)
-        picture = await photo.read()
+        photos = [await file.read() for file in files]
     try:
         async with AsyncClient(
             os.environ["VEILFACE_URL"], os.environ["VEILFACE_API_KEY"]
         ) as veilface:
-            accepted = bool(await veilface.verify(name, picture))
+            accepted = bool(await veilface.verify(name, photos))
     except (Unauthorized, Forbidden):  # our key, not their face
         return page("Logging in by face does not work now.", 502, asked)
     except ServiceError as error:  # no face in the photo, locked out …
@@ -232,7 +235,7 @@ async def login(request: Request) -> Response:
     except VeilfaceError:
         return page("Logging in by face does not work now.", 502, asked)
     if not accepted:
-        return page("That did not match. Try again.", 401, asked)
+        return page("Not recognised. Try again.", 401, asked)
     if asked.number in used:  # by a request beside this one
         return page("This login has expired. Start again in the application.", 400)
     keep(used, asked.number, True)

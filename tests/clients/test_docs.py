@@ -34,11 +34,11 @@ PYTHON = [
 
 @pytest.fixture
 def newcomer(service: Running, token: str, tmp_path: Path) -> tuple[Path, dict[str, str]]:
-    """A folder with four photos and a pack, on a service where nobody is enrolled."""
+    """A folder with six photos and a pack, on a service where nobody is enrolled."""
     with Client(service.url, token) as client:
         for subject in list(client.subjects()):
             client.erase(subject.subject_id)
-    for shot in range(4):
+    for shot in range(6):
         (tmp_path / f"anna{shot + 1}.jpg").write_bytes(photo(1, shot))
     (tmp_path / "buffalo_l").symlink_to(service.pack)
     path = f"{VEILFACE.parent}:{os.environ['PATH']}"

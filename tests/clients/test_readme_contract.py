@@ -18,21 +18,15 @@ from veilface_client import Client, PrivateClient
 def test_who_is_enrolled_by_photos_is_verified_without_sending_one(tmp_path: Path) -> None:
     pack = build_demo_pack(tmp_path / "pack")
     faces = draw(tmp_path / "faces", range(5000, 5400), range(1))
-    people = draw(tmp_path / "people", range(6000, 6080), range(4))
     anna = draw(tmp_path / "anna", range(1, 2), range(7)) / "person-1"
     photos = [anna / f"{number}.png" for number in range(7)]
     bin_folder = tmp_path / ".venv" / "bin"
     bin_folder.mkdir(parents=True)
     (bin_folder / "activate").write_text(f"export PATH={Path(sys.executable).parent}:$PATH\n")
-    values = {"PACK": str(pack), "FACES": str(faces), "PEOPLE": str(people)}
+    values = {"PACK": str(pack), "FACES": str(faces)}
     prepare, _ = with_values(BLOCKS[1], values).rsplit("\nveilface serve", 1)
     env = {k: v for k, v in os.environ.items() if not k.startswith("VEILFACE_")}
-    # So few drawn faces give no private contract.
-    env |= {
-        "VEILFACE_DEMO": "true",
-        "VEILFACE_ACCEPT_WEAK_PRIVACY": "true",
-        "OMP_NUM_THREADS": "1",
-    }
+    env |= {"VEILFACE_DEMO": "true", "OMP_NUM_THREADS": "1"}
     private = "PRIVATE=$(veilface keys create --right verify --right embeddings)"
     script = f'{prepare}\n{private}\necho "$PRIVATE"'
     done = subprocess.run(

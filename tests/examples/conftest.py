@@ -80,7 +80,6 @@ def service(world: World, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
     env = clean_environment(
         VEILFACE_PACK=str(world.pack),
         VEILFACE_DATA_DIR=str(data),
-        VEILFACE_ACCEPT_WEAK_PRIVACY="true",
         VEILFACE_PORT=str(port),
     )
     url = f"http://127.0.0.1:{port}"

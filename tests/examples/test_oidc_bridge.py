@@ -82,7 +82,7 @@ def begin(bridge: httpx.Client, **changes: str) -> str:
 
 def show(bridge: httpx.Client, cookie: str, name: str, photo: bytes) -> httpx.Response:
     return bridge.post(
-        "/login", data={"name": name}, files={"photo": photo}, headers={"Cookie": cookie}
+        "/login", data={"name": name}, files={"images": photo}, headers={"Cookie": cookie}
     )
 
 
@@ -204,7 +204,7 @@ def test_another_face_gets_no_code(bridge: httpx.Client, service: Service) -> No
 
 
 def test_a_body_that_is_too_large_is_not_read(bridge: httpx.Client) -> None:
-    assert bridge.post("/login", content=bytes(10_000_001)).status_code == 413
+    assert bridge.post("/login", content=bytes(20_000_001)).status_code == 413
     assert bridge.post("/token", content=iter([b"x"])).status_code == 413, "in chunks"
 
 

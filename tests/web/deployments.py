@@ -65,7 +65,7 @@ def real_service(folder: Path, pack: Path, aligned: Path) -> Iterator[Served]:
     contract = _beyond_chance(calibrated, 6.0)
     contract.save(settings.resolved_contract_file, file_sealer(open_keyring(settings)))
     options = {"--data-dir": settings.data_dir, "--pack": pack}
-    flags = ["--accept-weak-privacy", *(str(part) for option in options.items() for part in option)]
+    flags = [str(part) for option in options.items() for part in option]
     with serving(folder, settings, *flags) as served:
         yield served
 

@@ -1,18 +1,22 @@
 """Axes and dimension that a calibration takes, and faces of which nobody knows who they are."""
 
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from api.cli.calibration import operating_point
-from api.cli.verdict import verdict_lines
+from api.cli.verdict import LIKE_OPENED, LIKE_PHOTOS, plain_lines, verdict_lines
 from models.extraction import Extraction
-from templates.contract.verdict import Verdict
+from templates.contract.levels import Rate
+from templates.contract.verdict import Judgement, Verdict
 from templates.space.lifting import Strategy
 from tests.verify.population import N, decoys, photos_of, unit
 from verify import CalibrationOptions
 from verify.preparation import without_lookalikes
+
+ROOT = Path(__file__).resolve().parents[3]
 
 
 @pytest.mark.parametrize("asked", [None, 8])
@@ -34,6 +38,69 @@ def test_so_few_people_show_nothing_of_any_dimension(asked: int | None) -> None:
     assert said.startswith("Privacy:  NOT SHOWN. ")
     assert "Not enough to pass: 15 people are too few to choose by" in said
     assert accuracy == "Accuracy: not measured: nobody has two photos."
+
+
+def judged(errors: int, trials: int, *, shortfall: str | None = None, **basis: int) -> Judgement:
+    value = errors / trials
+    rate = Rate(errors=errors, trials=trials, ci_low=value, ci_high=value)
+    bound = None if basis else 0.1
+    return Judgement(rate, 0.05, basis, shortfall=shortfall, bound=bound)
+
+
+PHOTOS = {"enrolled_photos": 3, "probe_photos": 2}
+
+
+@pytest.mark.parametrize(
+    ("privacy", "accuracy", "said"),
+    [
+        (
+            judged(43, 600),
+            judged(10, 500, **PHOTOS),
+            [
+                "Privacy: not proven. If the database and the master key are both stolen, about "
+                "1 person in 14 could be recognised elsewhere (43 of 600).",
+                "it was about 1 in 26 where that was measured: on LFW",
+                "Accuracy: 1 genuine attempt in 50 is rejected (10 of 500), with three photos "
+                "enrolled and two shown.",
+            ],
+        ),
+        (
+            judged(270, 300),
+            judged(0, 90, shortfall="90 genuine probes are too few", **PHOTOS),
+            [
+                "about 9 in 10 people could be recognised elsewhere",
+                "Accuracy: none of 90 genuine attempts is rejected, with three photos enrolled and "
+                "two shown. Few were measured: 90 genuine probes are too few.",
+            ],
+        ),
+        (
+            judged(2, 15, shortfall="15 people are too few"),
+            None,
+            ["Privacy: not proven: 15 people are too few. With", "Accuracy: not measured: nobody"],
+        ),
+        (judged(0, 300), None, ["Privacy: proven", "none of the 300 people attacked could be"]),
+    ],
+)
+def test_the_verdict_in_words_for_everybody(
+    privacy: Judgement, accuracy: Judgement | None, said: list[str]
+) -> None:
+    lines = "\n".join(plain_lines(Verdict(privacy, accuracy)))
+    assert all(part in lines for part in said), lines
+    assert ("was measured" in lines) == (privacy.status != "PASS")
+
+
+def test_what_more_photos_bring_stands_in_the_measurements() -> None:
+    page = (ROOT / "docs" / "results" / "privacy.md").read_text(encoding="utf-8")
+    (table,) = (
+        part for part in page.split("\n\n") if part.startswith("| spared") and "| 300" in part
+    )
+    rows = re.findall(r"^\| ([\d,]+) \| .*?\((\d+)/(\d+)", table, flags=re.M)
+    counted = [
+        (int(errors), int(trials))
+        for spared, errors, trials in rows
+        if int(spared.replace(",", "")) >= LIKE_PHOTOS
+    ]
+    assert tuple(map(sum, zip(*counted, strict=True))) == LIKE_OPENED
 
 
 def test_of_faces_that_look_alike_the_first_stays() -> None:

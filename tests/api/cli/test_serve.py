@@ -22,14 +22,9 @@ from templates.keys.sealing import MasterKeyring
 from tests.api.cli.conftest import Ran, key_file, run
 from tests.patience import PATIENCE_S
 
-WEAK = ("--accept-weak-privacy",)
-"""So few drawn people give no private contract."""
-
 
 def warnings(ran: Ran) -> list[str]:
-    """Warnings, but for that of weak privacy."""
-    lines = [line for line in ran.stderr.splitlines() if line.startswith("warning: ")]
-    return [line for line in lines if "weak privacy is accepted" not in line]
+    return [line for line in ran.stderr.splitlines() if line.startswith("warning: ")]
 
 
 @contextmanager
@@ -38,7 +33,7 @@ def started(folder: Path, *arguments: str) -> Iterator[tuple["subprocess.Popen[b
     environment = {k: v for k, v in os.environ.items() if not k.startswith("VEILFACE_")}
     with (folder / "out").open("w") as output, (folder / "err").open("w") as errors:
         process = subprocess.Popen(
-            [sys.executable, "-m", "veilface", "serve", "--port", "0", *WEAK, *arguments],
+            [sys.executable, "-m", "veilface", "serve", "--port", "0", *arguments],
             env={**environment, "PYTHONUNBUFFERED": "1"},
             stdout=output,
             stderr=errors,
@@ -64,10 +59,7 @@ def started(folder: Path, *arguments: str) -> Iterator[tuple["subprocess.Popen[b
 
 def test_it_serves_prints_no_key_and_ends_by_sigterm(world, data, tmp_path):
     common = ("--data-dir", str(data), "--pack", str(world.pack))
-    assert (
-        "`veilface keys create --out FILE` makes one"
-        in run("serve", "--check", *common, *WEAK).stderr
-    )
+    assert "`veilface keys create --out FILE` makes one" in run("serve", "--check", *common).stderr
     made = run("keys", "create", "--right", "verify", "--data-dir", str(data), "--json")
     token = made.json["token"]
     with started(tmp_path, *common) as (process, url):
@@ -84,7 +76,7 @@ def test_it_serves_prints_no_key_and_ends_by_sigterm(world, data, tmp_path):
     assert "vf_" not in log + (tmp_path / "out").read_text()
     assert "Traceback" not in log
 
-    again = run("serve", "--check", *common, *WEAK)
+    again = run("serve", "--check", *common)
     assert again.status == 0
     assert "API key" not in again.stderr
     assert not warnings(again)
@@ -106,7 +98,7 @@ def test_the_check_warns_where_browsers_lift_and_too_many_are_rejected(
     )
     lifted = replace(lifted, levels=levels, calibration_id="")
     replace(contract, calibrations=(photos, lifted)).save(data / "contract.json", sealer)
-    check = ("serve", "--check", "--data-dir", data, "--pack", world.pack, *WEAK)
+    check = ("serve", "--check", "--data-dir", data, "--pack", world.pack)
     said = warnings(run(*check, "--serve-pack"))
     assert len(said) == warned
     for line in said:
@@ -117,7 +109,7 @@ def test_the_check_warns_where_browsers_lift_and_too_many_are_rejected(
 
 
 def test_a_master_key_beside_the_database_is_used_with_a_warning(world, data):
-    check = ("serve", "--check", "--data-dir", data, "--pack", world.pack, *WEAK)
+    check = ("serve", "--check", "--data-dir", data, "--pack", world.pack)
     key_file(data).rename(data / "master.key")  # where an earlier version made it
     ran = run(*check)
     assert ran.status == 0, ran.stderr
@@ -151,7 +143,7 @@ def test_a_taken_port_is_named(world, data):
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        ran = run("serve", "--data-dir", data, "--pack", world.pack, "--port", str(port), *WEAK)
+        ran = run("serve", "--data-dir", data, "--pack", world.pack, "--port", str(port))
     assert ran.status == 1
     assert f"cannot listen on 127.0.0.1:{port}" in ran.stderr
 

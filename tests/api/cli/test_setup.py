@@ -16,7 +16,6 @@ import pytest
 from api.cli import setup as command
 from api.cli.errors import CommandError
 from api.cli.roles import assign_roles
-from api.settings import load_settings
 from models.demo import build_demo_pack
 from tests.api.cli.conftest import Ran, World, draw, key_file, run
 from tests.once import made_once
@@ -70,7 +69,7 @@ def test_the_plan_is_shown_and_nothing_is_done(folders: Path) -> None:
     assert sorted(folders.iterdir()) == before
 
 
-def test_people_who_are_not_labelled_or_too_few_are_refused_with_the_reason(folders: Path) -> None:
+def test_people_who_are_not_labelled_are_refused_with_the_reason(folders: Path) -> None:
     for number, photo in enumerate(sorted(Path("people").glob("*/*.png"))):
         photo.rename(folders / f"{number}.png")
     for person in Path("people").iterdir():
@@ -80,16 +79,34 @@ def test_people_who_are_not_labelled_or_too_few_are_refused_with_the_reason(fold
     refused = setup()
     assert refused.status == 1
     assert "50 photos and no folder for a person: nobody is labelled" in refused.stderr
-    draw(folders / "few", range(3), range(2))
-    refused = run("setup", "few", "--faces", "faces", "--pack", "pack")
-    assert refused.status == 1
-    assert "Cannot be promised: any false match rate" in refused.stdout
-    assert "few resolves no rate of false matches" in refused.stderr
-    for more in ((), ("--dry-run",)):
-        refused = run("setup", "few", "--faces", "faces", "--pack", "pack", "--json", *more)
-        assert (refused.status, refused.json["people"], refused.json["can"]) == (1, 3, [])
-        assert refused.json["cannot"][0].startswith("any false match rate")
     assert not (folders / "veilface-data").exists()
+
+
+def test_faces_too_few_for_a_threshold_are_refused_with_the_number(folders: Path) -> None:
+    refused = run("setup", "--faces", "faces", "--pack", "pack")
+    assert refused.status == 1
+    assert "--faces has 100 photos: half of them set the thresholds" in refused.stderr
+    assert "give 200 or more" in refused.stderr
+    assert not (folders / "veilface-data").exists()
+
+
+def test_five_colleagues_are_left_aside_and_thresholds_set_on_the_faces(folders: Path) -> None:
+    colleagues = draw(folders / "colleagues", range(7000, 7005), range(3))
+    draw(folders / "faces", range(5100, 5200), range(1))
+    shutil.copy(colleagues / "person-7000" / "0.png", folders / "faces" / "person-7000.png")
+    (folders / "faces" / "person-7001").symlink_to(colleagues / "person-7001")
+    arguments = ("setup", colleagues, "--faces", "faces", "--pack", "pack")
+    plan = run(*arguments, "--dry-run", "--json")
+    assert plan.status == 0
+    assert (
+        "note: 5 people with 15 photos are too few to set a threshold by: 25 resolve that 1 "
+        "stranger in 100 is accepted, and 80 that 1 in 1,000 is: thresholds are set on --faces "
+        "instead" in plan.stderr
+    )
+    assert (plan.json["labelled"], plan.json["people"], plan.json["faces"]) == (False, 100, 101)
+    refused = run(*arguments, "--like", "people")
+    assert refused.status == 2
+    assert "PEOPLE are too few" in refused.stderr
 
 
 def test_nobody_is_in_two_roles(tmp_path: Path) -> None:
@@ -130,7 +147,7 @@ def prepared(
         assert "a defect of veilface" not in ran.stderr
         return ran
 
-    return partial(call, "--data-dir", data, "--accept-weak-privacy")
+    return partial(call, "--data-dir", data)
 
 
 def test_what_is_there_is_kept_and_the_rest_is_made(
@@ -141,30 +158,29 @@ def test_what_is_there_is_kept_and_the_rest_is_made(
     kept = [data / "decoys.veil", data / "contract.json", key_file(data)]
     before = [file.read_bytes() for file in kept]
     first = run(*arguments, "--data-dir", data, "--json")
-    assert first.status == 1
-    assert "refuses this contract" in first.stderr
-    assert (first.json["servable"], first.json["contract_kept"]) == (False, True)
+    assert first.status == 0, first.stderr
+    assert first.json["verdict"]["privacy"]["status"] == "NOT SHOWN"
+    assert first.json["contract_kept"] is True
     assert first.json["steps"] == {
         **dict.fromkeys(("master key", "decoys", "contract"), "kept"),
-        "API key": "made",
+        **dict.fromkeys(("API key", "settings"), "made"),
     }
     assert [file.read_bytes() for file in kept] == before
     token = key_file(data).with_name("api-key")
     assert token.read_text().startswith("vf_")
     assert stat.S_IMODE(token.stat().st_mode) == 0o600
-
-    assert not Path("veilface.toml").exists()
-    again = run(*arguments, "--data-dir", data, "--accept-weak-privacy")
-    assert again.status == 0, again.stderr
     assert tomllib.loads(Path("veilface.toml").read_text()) == {
         "data_dir": str(data),
         "pack": str(world.pack),
-        "accept_weak_privacy": True,
     }
-    assert again.stderr.count("is there and kept") == 4
+
+    again = run(*arguments, "--data-dir", data)
+    assert again.status == 0, again.stderr
+    assert again.stderr.count("is there and kept") == 5
     assert "These are promises of a contract made anew." in again.stdout
-    privacy, accuracy, _key, start, page, enroll, verify = again.stdout.splitlines()[-7:]
-    assert privacy.startswith("Privacy:  NOT SHOWN.")
+    assert token.read_text() not in again.stdout + again.stderr
+    start, page, enroll, verify, privacy, accuracy = again.stdout.splitlines()[-6:]
+    assert privacy.startswith("Privacy: not proven: ")
     assert accuracy.startswith("Accuracy: ")
     assert start == "Start it: veilface serve"
     assert page.endswith(f"open http://127.0.0.1:8421/ and sign in with the key in {token}")
@@ -174,12 +190,11 @@ def test_what_is_there_is_kept_and_the_rest_is_made(
     ):
         assert f"curl -X {rest} -H " in call
         assert f"$(cat {token})" in call
-    assert load_settings().accept_weak_privacy
     checked = run("serve", "--check")
     assert checked.status == 0, checked.stderr
     keys = run("keys", "list", "--json").json
     assert [(key["label"], key["rights"]) for key in keys] == [
-        ("setup", ["enroll", "erase", "verify"])
+        ("setup", ["admin", "enroll", "erase", "scores", "verify"])
     ]
 
 
@@ -224,12 +239,10 @@ def test_settings_of_somebody_else_are_kept(
     ran = prepared("--pack", world.pack)
     assert ran.status == 1
     assert file.read_text() == "port = 9000\n"
-    assert "says something else of data_dir, pack, accept_weak_privacy" in ran.stderr
+    assert "says something else of data_dir, pack" in ran.stderr
     assert f'data_dir = "{data}"' in ran.stderr
     assert "Start it" not in ran.stdout
-    agreeing = (
-        f'port = 9000\npack = "{world.pack}"\ndata_dir = "data"\naccept_weak_privacy = true\n'
-    )
+    agreeing = f'port = 9000\npack = "{world.pack}"\ndata_dir = "data"\n'
     file.write_text(agreeing)
     ran = prepared()
     assert ran.status == 0, ran.stderr
@@ -263,7 +276,7 @@ def test_from_nothing_to_a_contract(folders: Path, monkeypatch: pytest.MonkeyPat
     shutil.copytree("people/person-6000", "people/Six, Thousand")
     with monkeypatch.context() as patch:
         patch.setattr(command, "share_done", recorded)
-        ran = setup("--accept-weak-privacy")
+        ran = setup()
     assert ran.status == 0, ran.stderr
     assert "look at them, and put the photos of one person into one folder:" in ran.stderr
     assert '"Six, Thousand",person-6000  1.000' in ran.stderr
@@ -278,7 +291,7 @@ def test_from_nothing_to_a_contract(folders: Path, monkeypatch: pytest.MonkeyPat
 
     executed: list[tuple[str, list[str]]] = []
     monkeypatch.setattr(os, "execv", lambda *given: executed.append(given))
-    assert setup("--accept-weak-privacy", "--serve").status == 0
+    assert setup("--serve").status == 0
     ((program, (_, *arguments)),) = executed
     served = subprocess.run([program, *arguments, "--check"], capture_output=True, check=False)
     assert served.returncode == 0, served.stderr

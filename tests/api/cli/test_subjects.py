@@ -14,7 +14,7 @@ STORED = ("--tenant", "default")
 def test_enroll_then_accept_and_reject(world, veilface):
     enrolled = veilface("enroll", "ann", *world.photos(1, range(3)), "--pack", world.pack, "--json")
     assert enrolled.status == 0, enrolled.stderr
-    assert "warning: weak privacy: a thief of a template" in enrolled.stderr
+    assert "note: privacy is not proven: a thief of a template" in enrolled.stderr
     assert enrolled.json["replaced"] is False
     assert enrolled.json["photos"] == 3
     assert DEMO_NOTICE in enrolled.stderr

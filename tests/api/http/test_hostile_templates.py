@@ -37,9 +37,7 @@ PEOPLE = M + 1
 @pytest.fixture(scope="module")
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Client, Deployment]]:
     """A service whose contract is calibrated on a population that is spread as faces are."""
-    deployment = deploy(
-        tmp_path_factory.mktemp("hostile"), lockout_after=0, accept_weak_privacy=True
-    )
+    deployment = deploy(tmp_path_factory.mktemp("hostile"), lockout_after=0)
     info = ModelPack.load(deployment.settings.pack, threads=1).info
     calibrated = contract()
     calibrated = dataclasses.replace(

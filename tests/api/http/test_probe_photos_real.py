@@ -50,7 +50,6 @@ def service(
         targets=(1e-2,),
     )
     contract.save(settings.resolved_contract_file, file_sealer(open_keyring(settings)))
-    settings = settings.model_copy(update={"accept_weak_privacy": True})
     with Client(create_app(settings), headers=bearer(deployment.token)) as client:
         yield client, deployment
 

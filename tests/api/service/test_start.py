@@ -352,7 +352,9 @@ def test_a_template_of_an_older_contract_is_refused(fresh: Deployment) -> None:
 
 
 @pytest.mark.parametrize("measured", [True, False])
-def test_weak_privacy_is_served_only_knowingly(fresh: Deployment, measured: bool) -> None:
+def test_privacy_that_is_not_proven_is_served_unless_it_is_required(
+    fresh: Deployment, measured: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
     settings = fresh.settings
     rate = Rate(errors=90, trials=400, ci_low=0.1, ci_high=0.3)
     made = fresh.contract.verdict
@@ -360,23 +362,24 @@ def test_weak_privacy_is_served_only_knowingly(fresh: Deployment, measured: bool
     weak = replace(fresh.contract, verdict=bad if measured else None)
     weak.save(settings.resolved_contract_file, file_sealer(open_keyring(settings)))
     why = "22.5 % of them (90 of 400), and 5 % is" if measured else "nobody measured"
-    refusing = Client(create_app(settings))
-    with pytest.raises(StartError, match="--accept-weak-privacy") as caught, refusing:
-        pass
-    assert why in str(caught.value)
-    check = ("serve", "--check", "--data-dir", settings.data_dir, "--pack", settings.pack)
-    refusal = run(*check)
-    assert refusal.status == 1
-    assert why in refusal.stderr
-
-    accepted = run(*check, "--accept-weak-privacy")
-    assert accepted.status == 0, accepted.stderr
-    assert f"weak privacy is accepted: {'a thief' if measured else 'nobody'}" in accepted.stderr
-    with Client(create_app(changed(fresh, accept_weak_privacy=True))) as client:
+    with Client(create_app(settings)) as client:
         answer = client.get("/v1/contract", headers=bearer(fresh.token)).json()
+        assert client.get("/health/ready").status_code == 200
     assert (answer["verdict"] and answer["verdict"]["privacy"]["status"]) == (
         "FAIL" if measured else None
     )
+    (line,) = (line for line in capsys.readouterr().err.splitlines() if "not proven" in line)
+    assert why in line
+    check = ("serve", "--check", "--data-dir", settings.data_dir, "--pack", settings.pack)
+    assert run(*check).status == 0
+
+    refusing = Client(create_app(changed(fresh, require_private=True)))
+    with pytest.raises(StartError, match="require_private") as caught, refusing:
+        pass
+    assert why in str(caught.value)
+    refusal = run(*check, "--require-private")
+    assert refusal.status == 1
+    assert why in refusal.stderr
 
 
 def test_the_cohort_is_lifted_before_a_probe_asks_for_it(fresh: Deployment) -> None:
