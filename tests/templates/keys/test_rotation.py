@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy import stats
-from scipy.fft import dct
 
 from templates.distances import Metric, pairwise_distances
 from templates.keys.randomness import Keystream
@@ -18,8 +17,6 @@ from templates.keys.rotation import (
 )
 from templates.keys.sealing import encode_parts
 from templates.space.lifting import lift
-
-KNOWN = [0.29210510032827836, 0.14434577434, 5.805401994660683, -3.454763042292888, -3.04232787677]
 
 
 def units(stream: Keystream, count: int, n: int) -> np.ndarray:
@@ -63,13 +60,6 @@ def test_rotation_follows_from_key_and_id_as_documented(n: int) -> None:
         expected = np.diag(each) @ cosine @ expected
     found = matrix(TenantRotation(key, n).of(template_id), n)
     np.testing.assert_allclose(found, expected, atol=1e-12)
-
-
-def test_a_known_answer() -> None:
-    """Computed once: what is stored must still be found by another version of this program."""
-    rotation = TenantRotation(bytes(range(32)), 5).of("00112233445566778899aabbccddeeff")
-    found = rotation.turned(np.array([[1.0, 2.0, 3.0, 4.0, 5.0]]))
-    np.testing.assert_allclose(found[0], KNOWN, atol=1e-9)
 
 
 @pytest.mark.parametrize("n", [2, 7, 64, 127, 512])
@@ -134,14 +124,6 @@ def test_entries_are_those_of_a_haar_rotation(n: int) -> None:
         [SignedCosineRotation(signs).turned(fixed[:1])[0] for signs in _signs(keys, 2, n)]
     )
     assert np.abs((single**2 * n).mean(axis=0) - 1).max() > 0.9
-
-
-@pytest.mark.parametrize("n", [2, 5, 64, 97, 512])
-def test_variances_are_even_whatever_the_vector(n: int) -> None:
-    """Over random signs, a transform C maps the variances of entries by the squares of C."""
-    squares = dct(np.eye(n), norm="ortho", axis=0) ** 2
-    variances = np.linalg.matrix_power(squares, TRANSFORMS)
-    assert np.abs(n * variances - 1).max() < (1 + 1e-9) / n
 
 
 def _signs(count: int, rows: int, n: int) -> NDArray[np.float64]:

@@ -39,15 +39,6 @@ def test_template_holds_the_set_and_is_canonical(n: int, m_part: float, seed: in
     np.testing.assert_allclose(template.foot, nearest, atol=1e-4)
 
 
-def test_foot_norm_is_the_cosine_to_a_unit_descriptor():
-    stream = Keystream.seeded("cosine")
-    members = units(stream, 6, 32)
-    template = through_all(members, 2, stream=stream)
-    cosines = members @ template.foot / np.linalg.norm(template.foot)
-    np.testing.assert_allclose(cosines, template.foot_norm, atol=1e-6)
-    assert template.radii[0] == pytest.approx(np.sqrt(1 - template.foot_norm**2))
-
-
 def test_equal_sets_give_equal_templates_whatever_describes_them():
     members = units(Keystream.seeded("members"), 9, 64)
     mixing = Keystream.seeded("mixing").normal((8, 8))

@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import sqlalchemy as sa
 
 from templates.keys.sealing import MasterKeyring
 from templates.store import Source, StoredTemplate, TemplateStore
 from templates.store.envelope import Envelope, close_envelope
+from templates.store.schema import Base
 from tests.databases import (  # noqa: F401
     database_url,
     migrate_ahead,
@@ -124,3 +126,24 @@ def put(
         photos=3,
         **changes,
     )
+
+
+def count(store: TemplateStore, table: type[Base]) -> int:
+    """Rows of a table."""
+    query = sa.select(sa.func.count()).select_from(table)
+    return int(store.database.read(lambda each: each.execute(query).scalar_one()))
+
+
+def pieces(blob: bytes) -> list[bytes]:
+    """Short runs of a blob: a page boundary may cut a long one in two."""
+    return [blob[at : at + 12] for at in range(0, len(blob) - 12, 12)]
+
+
+def found(folder: Path, wanted: list[bytes]) -> dict[str, int]:
+    """How many of the pieces stand in each file of the folder."""
+    counts = {}
+    for path in sorted(folder.iterdir()):
+        content = path.read_bytes()
+        if hits := sum(piece in content for piece in wanted):
+            counts[path.name] = hits
+    return counts

@@ -1,7 +1,5 @@
 import hashlib
 import hmac
-import threading
-from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
 from unittest import mock
 
@@ -189,24 +187,6 @@ def test_only_a_valid_key_is_replaced(store: TemplateStore, clock: Clock) -> Non
     assert not [line for line in audit(store) if line[0] == "key-replace"]
     with pytest.raises(StoreError, match="nothing or more"):
         keys.replace(revoked.key.prefix, grace=-grace)
-
-
-def test_a_key_that_is_replaced_and_revoked_at_once_ends_revoked(store: TemplateStore) -> None:
-    keys = store.api_keys
-    for _ in range(10):
-        old = keys.create("default", [Right.VERIFY])
-        start = threading.Barrier(2)
-
-        def replace(prefix: str = old.key.prefix, start: threading.Barrier = start) -> object:
-            start.wait()
-            return keys.replace(prefix, grace=timedelta(hours=1))
-
-        with ThreadPoolExecutor(1) as threads:
-            replacing = threads.submit(replace)
-            start.wait()
-            assert keys.revoke(old.key.prefix)
-            replacing.result()
-        assert keys.verify(old.token) is None
 
 
 def test_a_key_keeps_its_lowest_level_and_so_does_the_one_that_replaces_it(

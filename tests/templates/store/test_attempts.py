@@ -521,18 +521,6 @@ def test_at_most_five_rejections_are_let_out_however_many_come_at_once(
     assert ada.audit_log.verify().intact
 
 
-def test_one_accept_among_many_failures_is_equal_to_some_order(ada: TemplateStore) -> None:
-    answers = in_threads(ada, [*[{}] * 6, {"accepted": True}, *[{}] * 7])
-    recorded = outcomes(ada)
-    if "accept" in recorded:
-        place = recorded.index("accept")
-        assert place < 5  # else the subject was locked, and the accept not let out
-        assert recorded[place + 1 :].count("reject") == 5
-        assert answers == {"accept": 1, "reject": place + 5, "locked": 8 - place}
-    else:
-        assert answers == {"reject": 5, "locked": 9}
-
-
 def test_of_many_with_one_token_one_is_decided(ada: TemplateStore) -> None:
     answers = in_threads(ada, [{"accepted": True, "token": TOKEN}] * 14)
     assert answers == {"accept": 1, "replayed": 13}

@@ -1,13 +1,12 @@
 import logging
 import threading
-from pathlib import Path
 
 import pytest
 import sqlalchemy as sa
 from alembic.config import Config
 from alembic.script import ScriptDirectory
 
-from templates.errors import SealError, StoreError
+from templates.errors import StoreError
 from templates.keys.sealing import MasterKeyring
 from templates.store import TemplateStore, migrate
 from templates.store.database import Database
@@ -90,18 +89,6 @@ def test_a_query_before_the_upgrade_names_the_remedy(
     with pytest.raises(StoreError, match="veilface db upgrade"):
         store.subjects.get("default", "ada")
     store.close()
-
-
-def test_another_master_key_is_refused_at_the_start(
-    store: TemplateStore, database_url: str, tmp_path: Path
-) -> None:
-    stranger = TemplateStore(database_url, MasterKeyring.create(tmp_path / "other.key"))
-    with pytest.raises(SealError, match="not the master key of this database"):
-        stranger.check()
-    with pytest.raises(SealError, match="not the master key of this database"):
-        stranger.upgrade()
-    stranger.close()
-    store.check()
 
 
 def test_migrating_leaves_logging_alone(database_url: str) -> None:

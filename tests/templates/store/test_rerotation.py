@@ -1,10 +1,8 @@
 import itertools
 import math
-import random
 import signal
 import subprocess
 import sys
-import threading
 import uuid
 from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
@@ -31,9 +29,8 @@ from templates.store.schema import RotationKeyRow, SubjectRow, TemplateRow
 from templates.store.subject_rows import SubjectTemplate
 from templates.store.tenants import RetiredRotation
 from tests.patience import PATIENCE_S
-from tests.templates.store.conftest import Clock, SlowSealing
+from tests.templates.store.conftest import Clock, SlowSealing, found, pieces
 from tests.templates.store.test_attempts import Says, decide
-from tests.templates.store.test_erasure import found, pieces
 
 N, M = 48, 4
 OPERATOR = By("operator:kim", "request-1")
@@ -494,84 +491,6 @@ def test_an_enrollment_under_way_is_waited_for_before_a_key_goes(
     assert ("moved", "default", "program", None, "epoch 2") in audit(store)
     assert epochs(store) == [2]
     assert people.own_distances().max() < 1e-3
-    service.close()
-
-
-def test_a_service_in_use_loses_nothing(
-    store: TemplateStore, database_url: str, key_file: Path
-) -> None:
-    service = TemplateStore(database_url, MasterKeyring.load(key_file))
-    people, users = People(store, 10), People(service, 10)
-    for name in people.names:
-        people.enroll(name)
-    errors: list[BaseException] = []
-    refused: list[str] = []
-    left: list[str] = []
-    stop = threading.Event()
-
-    def use(seed: int) -> None:
-        generator = random.Random(seed)
-        try:
-            while not stop.is_set():
-                name = generator.choice(users.names)
-                try:
-                    if generator.random() < 0.2:
-                        service.erasures.erase("default", name)
-                    users.enroll(name)
-                except StoreUnavailable as error:
-                    refused.append(str(error))
-                service.subjects.get("default", name)
-        except BaseException as error:
-            errors.append(error)
-
-    def verify() -> None:
-        try:
-            while not stop.is_set():
-                for name, point in zip(users.names, users.points, strict=True):
-                    stored = service.subjects.get("default", name)
-                    if stored is None:
-                        continue
-                    try:
-                        rotation = users.rotation(stored)
-                    except RetiredRotation:
-                        continue  # moved and retired since it was read: the caller reads it again
-                    subspace = SubspaceBatch.of([wire.decode(stored.wire).subspace])
-                    probe = rotation.turned(point[None])
-                    assert pairwise_distances(probe, subspace, metric="euclidean").max() < 1e-2
-        except BaseException as error:
-            errors.append(error)
-
-    threads = [threading.Thread(target=use, args=(seed,)) for seed in range(2)]
-    threads.append(threading.Thread(target=verify))
-    for thread in threads:
-        thread.start()
-    try:
-        for _ in range(3):
-            store.rerotation.begin("default")
-            with ThreadPoolExecutor(2) as movers:
-                moving = [movers.submit(store.rerotation.move, "default", binding(), batch=3)] * 2
-                for each in moving:
-                    each.result()
-            while True:
-                try:
-                    store.rerotation.retire("default")
-                    break
-                except StoreError as error:
-                    left.append(str(error))
-                    store.rerotation.move("default", binding())
-    finally:
-        stop.set()
-        for thread in threads:
-            thread.join()
-    assert errors == []
-    assert all("renewed meanwhile" in each for each in refused)
-    assert all("move them first" in each for each in left)
-    for name in people.names:
-        if store.subjects.describe("default", name) is None:
-            people.enroll(name)
-    assert people.own_distances().max() < 1e-2
-    assert epochs(store) == [4]
-    assert store.audit_log.verify().intact
     service.close()
 
 

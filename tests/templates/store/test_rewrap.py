@@ -1,4 +1,3 @@
-import threading
 from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 
@@ -105,47 +104,6 @@ def test_an_interrupted_rotation_goes_on_where_it_stopped(
     store.wrapped_keys.rewrap()
     assert len(store.wrapped_keys.count()) == 1
     assert wires(store) == {name: name.encode() for name in SUBJECTS}
-
-
-def test_a_service_in_use_loses_nothing(
-    store: TemplateStore, database_url: str, key_file: Path
-) -> None:
-    for name in SUBJECTS:
-        put(store, name, name.encode())
-    # A service with its own copy of the keyring, as another process has.
-    service = TemplateStore(database_url, MasterKeyring.load(key_file))
-    latest = {name: name.encode() for name in SUBJECTS}
-    errors: list[Exception] = []
-    stop = threading.Event()
-
-    def use() -> None:
-        number = 0
-        try:
-            while not stop.is_set():
-                name = SUBJECTS[number % len(SUBJECTS)]
-                wire = f"{name} {number}".encode()
-                put(service, name, wire)
-                latest[name] = wire
-                found = service.subjects.get("default", SUBJECTS[(7 * number) % len(SUBJECTS)])
-                assert found is not None
-                number += 1
-        except Exception as error:
-            errors.append(error)
-
-    thread = threading.Thread(target=use)
-    thread.start()
-    for _ in range(3):
-        current = MasterKeyring.add_current(key_file)
-        store.wrapped_keys.rewrap(batch=3)
-    stop.set()
-    thread.join()
-    assert errors == []
-    store.wrapped_keys.rewrap()
-    MasterKeyring.drop_retired(key_file, keep=current)
-    fresh = TemplateStore(database_url, MasterKeyring.load(key_file))
-    assert wires(fresh) == latest
-    service.close()
-    fresh.close()
 
 
 def test_a_write_that_sealed_before_the_rotation_is_waited_for(

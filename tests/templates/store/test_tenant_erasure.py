@@ -1,7 +1,3 @@
-import json
-import random
-import threading
-import time
 from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 
@@ -19,8 +15,6 @@ from templates.store import (
     UnknownTenant,
     verify_receipt,
 )
-from templates.store.database import Database
-from templates.store.erasure import Erasure
 from templates.store.schema import (
     ApiKeyRow,
     Base,
@@ -32,9 +26,8 @@ from templates.store.schema import (
     TenantRow,
 )
 from tests.patience import PATIENCE_S
-from tests.templates.store.conftest import Clock, SlowSealing, compact_until, put
+from tests.templates.store.conftest import Clock, SlowSealing, count, put
 from tests.templates.store.test_attempts import attempt
-from tests.templates.store.test_erasure import count, found, pieces
 
 OPERATOR = By("operator:kim", "request-1")
 OF_A_TENANT = (
@@ -76,7 +69,7 @@ def outcomes(store: TemplateStore) -> list[str]:
 
 def nothing_is_left(store: TemplateStore, *, tenants: int) -> bool:
     """Whether the tables hold what empty tenants hold: their row and a rotation key."""
-    held = {table: count(store.database, table) for table in OF_A_TENANT}
+    held = {table: count(store, table) for table in OF_A_TENANT}
     expected = dict.fromkeys(OF_A_TENANT, 0) | {TenantRow: tenants, RotationKeyRow: tenants}
     return held == expected
 
@@ -96,9 +89,7 @@ def test_everything_of_the_tenant_goes_and_nothing_of_another(
     assert claims["erased_at"] == clock.time.isoformat()
     assert "subject" not in claims
     assert erasure.receipt.held
-    left = {
-        table: count(store.database, table) for table in OF_A_TENANT if table is not TemplateRow
-    }
+    left = {table: count(store, table) for table in OF_A_TENANT if table is not TemplateRow}
     assert left == {
         SubjectRow: theirs["subjects"],
         RotationKeyRow: theirs["rotation_keys"],
@@ -106,7 +97,7 @@ def test_everything_of_the_tenant_goes_and_nothing_of_another(
         FailedAttemptsRow: theirs["failed_attempts"],
         TenantRow: 1,
     }
-    assert count(store.database, TemplateRow) == theirs["templates"]
+    assert count(store, TemplateRow) == theirs["templates"]
     with pytest.raises(UnknownTenant):
         store.tenants.get("default")
     assert store.subjects.list("default").records == ()
@@ -165,72 +156,6 @@ def test_a_forged_receipt_sets_no_epoch(store: TemplateStore) -> None:
         store.tenants.create("default")
 
 
-def test_a_receipt_of_a_tenant_survives_json_and_shows_alteration(store: TemplateStore) -> None:
-    receipt = store.erasures.erase_tenant("default").receipt
-    key = store.signer.public_key()
-    assert Receipt.from_json(json.loads(json.dumps(receipt.to_json()))) == receipt
-    altered = Receipt(receipt.body.replace("default", "defaulT"), receipt.signature)
-    with pytest.raises(StoreError, match="signature"):
-        verify_receipt(altered, key)
-
-
-@pytest.mark.parametrize("tenant_goes_first", [False, True])
-def test_concurrent_enrollments_leave_nothing(
-    store: TemplateStore, database_url: str, key_file: Path, tenant_goes_first: bool
-) -> None:
-    service = TemplateStore(database_url, MasterKeyring.load(key_file))
-    fill(store, "default", subjects=0 if tenant_goes_first else 40)
-    errors: list[BaseException] = []
-    acknowledged: list[str] = []
-    ready, done = threading.Barrier(4), threading.Event()
-
-    def enroll(seed: int) -> None:
-        generator = random.Random(seed)
-        ready.wait()
-        while True:
-            name = f"s{generator.randrange(60)}"
-            over = done.is_set()
-            time.sleep(0.005)  # SQLite's lock is polled: without a pause others never get it
-            try:
-                match generator.randrange(3):
-                    case 0:
-                        service.erasures.erase("default", name)
-                    case 1:
-                        attempt(service, name, contract_id="d" * 64)
-                    case 2:
-                        put(service, name, b"wire")
-                        acknowledged.append(name)
-                assert not over, "a write of an erased tenant was acknowledged"
-            except UnknownTenant:
-                return
-            except BaseException as error:
-                errors.append(error)
-                return
-
-    threads = [threading.Thread(target=enroll, args=(seed,)) for seed in range(3)]
-    for thread in threads:
-        thread.start()
-    ready.wait()
-    erasure = store.erasures.erase_tenant("default")
-    done.set()
-    for thread in threads:
-        thread.join()
-    assert errors == []
-    assert erasure.erased
-    assert nothing_is_left(store, tenants=1)
-    receipts = count_subject_receipts(store)
-    enrolled = len({*acknowledged, *(() if tenant_goes_first else (f"s{i}" for i in range(40)))})
-    # Everybody who was ever enrolled was erased alone, or with the tenant.
-    assert counted(erasure.receipt)["subjects"] + receipts >= enrolled
-    assert store.audit_log.verify().intact
-    service.close()
-
-
-def count_subject_receipts(store: TemplateStore) -> int:
-    lines = store.audit_log.lines()
-    return sum(line.action == "erase" and line.outcome == "erased" for line in lines)
-
-
 def test_an_enrollment_under_way_goes_with_the_tenant(
     store: TemplateStore, database_url: str, key_file: Path, slow_sealing: SlowSealing
 ) -> None:
@@ -248,27 +173,6 @@ def test_an_enrollment_under_way_goes_with_the_tenant(
     assert counted(erasure.receipt)["subjects"] == 1
     assert nothing_is_left(store, tenants=1)
     service.close()
-
-
-def test_of_two_that_erase_at_once_one_does(
-    store: TemplateStore, database_url: str, key_file: Path
-) -> None:
-    other = TemplateStore(database_url, MasterKeyring.load(key_file))
-    everything = fill(store, "default", subjects=12)
-    start = threading.Barrier(4)
-
-    def erase(each: TemplateStore) -> Erasure:
-        start.wait()
-        return each.erasures.erase_tenant("default")
-
-    with ThreadPoolExecutor(4) as threads:
-        running = [threads.submit(erase, each) for each in (store, other, store, other)]
-        erasures = [each.result() for each in running]
-    assert sum(each.erased for each in erasures) == 1
-    assert len({each.receipt for each in erasures}) == 1
-    assert counted(erasures[0].receipt) == everything
-    assert nothing_is_left(store, tenants=1)
-    other.close()
 
 
 def test_every_table_of_a_tenant_is_known() -> None:
@@ -291,66 +195,3 @@ def test_every_table_of_a_tenant_is_known() -> None:
         if any(column.name in ("tenant_id", "subject_pk") for column in table.columns)
     }
     assert columns == of_tenant - {"tenants"}
-
-
-def test_sqlite_files_keep_nothing_of_an_erased_tenant(
-    tmp_path: Path, keyring: MasterKeyring
-) -> None:
-    folder = tmp_path / "data"
-    folder.mkdir()
-    url = f"sqlite:///{folder / 'veilface.db'}"
-    store = TemplateStore(url, keyring)
-    store.upgrade()
-    for tenant in ("default", "other"):
-        store.tenants.create(tenant)
-    generator = random.Random(9)
-    for number in range(12):
-        put(store, f"subject-{number:04}", generator.randbytes(9_000))
-    key = store.api_keys.create("default", [Right.VERIFY], label="a label to look for").key
-    put(store, "their-subject", generator.randbytes(9_000), tenant="other")
-    database = Database(url)
-
-    def secrets(connection: sa.Connection) -> list[bytes]:
-        tenant_id = store.tenants.get("default").id
-        queries = [
-            sa.select(TemplateRow.ciphertext)
-            .join(SubjectRow, SubjectRow.id == TemplateRow.subject_pk)
-            .where(SubjectRow.tenant_id == tenant_id),
-            sa.select(SubjectRow.wrapped_key).where(SubjectRow.tenant_id == tenant_id),
-            sa.select(RotationKeyRow.wrapped_key).where(RotationKeyRow.tenant_id == tenant_id),
-            sa.select(ApiKeyRow.token_hash).where(ApiKeyRow.tenant_id == tenant_id),
-        ]
-        blobs = [blob for query in queries for blob in connection.execute(query).scalars()]
-        # The first bytes of a sealed blob name its master key, which others share.
-        return [piece for blob in blobs for piece in pieces(blob[9:])]
-
-    wanted = database.read(secrets)
-    wanted += [f"subject-{number:04}".encode() for number in range(12)]
-    wanted.append(key.label.encode())
-    assert max(found(folder, wanted).values()) >= 0.9 * len(wanted)
-    assert store.erasures.erase_tenant("default").log_purged
-    assert found(folder, wanted) == {}
-    assert (folder / "veilface.db-wal").stat().st_size == 0
-    assert store.subjects.get("other", "their-subject") is not None
-    database.close()
-    store.close()
-
-
-def test_postgresql_keeps_no_row_after_compacting(
-    postgres_url: str, keyring: MasterKeyring
-) -> None:
-    """What the documentation says of VACUUM: dead rows are in the tables' files until then."""
-    store = TemplateStore(postgres_url, keyring)
-    store.upgrade()
-    store.tenants.create("default")
-    fill(store, "default")
-    tables = ["subjects", "templates", "rotation_keys", "api_keys", "failed_attempts"]
-
-    def sizes(connection: sa.Connection) -> list[int]:
-        query = sa.select(*(sa.func.pg_relation_size(table) for table in tables))
-        return list(connection.execute(query).one())
-
-    store.erasures.erase_tenant("default")
-    assert min(store.database.read(sizes)) > 0
-    compact_until(store, lambda: set(store.database.read(sizes)) == {0})
-    store.close()
