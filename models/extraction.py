@@ -28,30 +28,32 @@ Advance = Callable[[int], None]
 
 
 @dataclass(frozen=True)
-class EncodedImage:
-    """An encoded photo in memory, and the name that stands for it in an :class:`Extraction`."""
-
-    name: str
-    data: bytes = field(repr=False)
-
-
-@dataclass(frozen=True, eq=False)
-class MarkedPhoto:
-    """A photo whose face somebody marked: it is aligned by that where the pack has no detector.
+class Photo:
+    """A photo by a name of its own, which stands for it in an :class:`Extraction`.
 
     Parameters
     ----------
-    keypoints : (5, 2) float64
-        Left eye, right eye, nose, left and right mouth corner, in pixels, as seen in the picture.
+    source
+        The file, or the encoded photo itself.
+    keypoints : (5, 2) float64, optional
+        Left eye, right eye, nose, left and right mouth corner, in pixels, as seen in the picture:
+        the face is aligned by them where the pack has no detector.
     """
 
-    photo: "Path | EncodedImage"
-    keypoints: NDArray[np.float64] = field(repr=False)
+    name: str
+    source: Path | bytes = field(repr=False)
+    keypoints: NDArray[np.float64] | None = field(default=None, repr=False, compare=False)
+
+    def read(self) -> bytes:
+        """Read the encoded photo; of a larger file one byte more than the decoder accepts."""
+        if isinstance(self.source, bytes):
+            return self.source
+        with self.source.open("rb") as file:
+            return file.read(DEFAULT_LIMITS.max_bytes + 1)
 
 
-Source = str | Path | EncodedImage | MarkedPhoto
 Embeddings = tuple[NDArray[np.float32], ...]
-"""What one file gave: its embedding, or the one without and the one with the mirror image."""
+"""What one photo gave: its embedding, or the one without and the one with the mirror image."""
 
 
 @dataclass(frozen=True)
@@ -135,28 +137,30 @@ class Extractor:
             for flip in ([False, True] if mirrored else [pack.info.preprocessing["flip"]])
         )
 
-    def extract(self, paths: Iterable[Source], *, progress: Advance | None = None) -> Extraction:
-        """Embed files.
+    def extract(
+        self, photos: Iterable[Path | Photo], *, progress: Advance | None = None
+    ) -> Extraction:
+        """Embed photos.
 
         Parameters
         ----------
-        paths
-            Files, or encoded photos, in any order; the order of the result follows it. An encoded
-            photo stands in the result under its name as a path.
+        photos
+            Files or photos, in any order; the order of the result follows it. A photo stands in
+            the result under its name as a path.
         progress
-            Called with the number of files done since the last call.
+            Called with the number of photos done since the last call.
 
         Returns
         -------
         Extraction
-            Every path is in ``paths`` or in ``failures``.
+            Every photo is in ``paths`` or in ``failures``.
 
         Raises
         ------
         ModelError
             If inference itself fails, which is not the fault of a file.
         """
-        files = [Path(path) if isinstance(path, str) else path for path in paths]
+        files = [one if isinstance(one, Photo) else Photo(str(one), one) for one in photos]
         prepared: list[_Prepared] = []
         keep_after = time.monotonic() + _KEPT_SECONDS
         try:
@@ -170,7 +174,7 @@ class Extractor:
         finally:
             if self._cache is not None:
                 self._cache.flush()
-        done = [(named(file), item) for file, item in zip(files, prepared, strict=True)]
+        done = [(Path(file.name), item) for file, item in zip(files, prepared, strict=True)]
         rows = [item.embeddings for _, item in done if item.failure is None]
         kinds = [
             np.stack([row[kind] for row in rows])
@@ -209,15 +213,14 @@ class Extractor:
         }
         return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).digest()
 
-    def _prepare(self, source: Path | EncodedImage | MarkedPhoto) -> "_Prepared":
+    def _prepare(self, photo: Photo) -> "_Prepared":
         """Read, look up, decode, find the face; whatever is wrong with the file is an answer."""
-        path = named(source)
+        path = Path(photo.name)
         try:
-            data = _read(source)
+            data = photo.read()
             content = hashlib.sha256(data).digest()
-            marks = None
-            if isinstance(source, MarkedPhoto) and self._trusts_marks:
-                marks = source.keypoints
+            marks = photo.keypoints if self._trusts_marks else None
+            if marks is not None:
                 content = hashlib.sha256(content + marks.tobytes()).digest()
             key = tuple(hashlib.sha256(kind + content).digest() for kind in self._kinds)
             known = () if self._cache is None else tuple(self._cache.get(part) for part in key)
@@ -267,19 +270,3 @@ class _Prepared:
     embeddings: Embeddings = field(default=(), repr=False)
     is_cached: bool = False
     failure: Failure | None = None
-
-
-def named(source: Source) -> Path:
-    """Path under which a source stands in an :class:`Extraction`."""
-    photo = source.photo if isinstance(source, MarkedPhoto) else source
-    return Path(photo.name if isinstance(photo, EncodedImage) else photo)
-
-
-def _read(source: Path | EncodedImage | MarkedPhoto) -> bytes:
-    if isinstance(source, MarkedPhoto):
-        return _read(source.photo)
-    if isinstance(source, EncodedImage):
-        return source.data
-    with source.open("rb") as file:
-        # One byte more than allowed, so that the decoder sees that it is too much.
-        return file.read(DEFAULT_LIMITS.max_bytes + 1)

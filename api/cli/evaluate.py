@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from api.cli.console import demo_notice, emit, message, progress, say, show
+from api.cli.console import demo_notice, message, progress
 from api.cli.descriptors import BULK, Cache, Flip, open_cache
 from api.cli.errors import UsageError, require_extra
 from api.cli.evaluation_inputs import (
@@ -16,10 +16,10 @@ from api.cli.evaluation_inputs import (
     open_sources,
     wants_raw_flip,
 )
-from api.cli.evaluation_report import summary, write_results
+from api.cli.evaluation_report import CAPTIONS, write_results
 from api.cli.inputs import listed, named_file
-from api.cli.options import PROCESSOR, AsJson, Device, chosen_device, quick, takes_settings
-from api.cli.results import Plan
+from api.cli.options import PROCESSOR, Device, chosen_device, quick
+from api.cli.results import Plan, Result, Table, reports
 from api.settings import Settings
 from templates.distances import Metric
 from verify.evaluation.cluster import cluster as dask_cluster
@@ -31,15 +31,17 @@ from verify.evaluation.plan import (
     TARGETS,
     EvaluationError,
     EvaluationPlan,
+    Json,
     Mode,
     default_strategies,
     units_of,
 )
+from verify.evaluation.tables import markdown, row_cells
 
 LIFTED_MODES = (Mode.POINT, Mode.SUBSPACE)
 
 
-@takes_settings(*BULK)
+@reports(*BULK)
 def evaluate(
     datasets: Annotated[
         list[Path],
@@ -135,8 +137,7 @@ def evaluate(
     device: Device = PROCESSOR,
     _quick: Annotated[bool, quick(dim="4,16", metric="spherical", repeats=1)] = False,
     _plan: Plan = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Result:
     """Evaluate face verification with private templates: the LFW / CFP / AgeDB protocol.
 
     Writes results.json, results.csv, results.md, figures (PNG and SVG) and results.html, which has
@@ -148,6 +149,7 @@ def evaluate(
     require_extra("evaluate")
     # Imported here: they load what the core install lacks.
     from verify.evaluation.experiment import evaluate as run_evaluation
+    from verify.evaluation.figures import det_figure, verification_figure
     from verify.evaluation.results import document
 
     torch_device = chosen_device(device, here=cluster is None)
@@ -204,20 +206,27 @@ def evaluate(
             "labels": named_file(labels),
         },
     )
-    written = write_results(results, out)
+    drawings = {"figure": verification_figure, "det": det_figure}
+    written = write_results(results, markdown(results), drawings, CAPTIONS, out)
     notice = {}
     if isinstance(embedder, PackEmbedder):
         info = embedder.pack.info
         notice = demo_notice(info.embedder_sha256, n=info.n)
-    if as_json:
-        emit({**notice, "out": str(out), "files": [path.name for path in written], **results})
-        return
-    for dataset in results["datasets"]:
-        show(summary(results, dataset["name"]))
-    for sentence in results["refused"]:
-        say(f"Not reported: {sentence}.")
-    say(f"{out}: {', '.join(path.name for path in written)}.")
-    say(f"To read it: {out / 'results.html'}")
+    return Result(
+        {**notice, "out": out, "files": [path.name for path in written], **results},
+        [
+            *(_summary(results, dataset["name"]) for dataset in results["datasets"]),
+            *(f"Not reported: {sentence}." for sentence in results["refused"]),
+            f"{out}: {', '.join(path.name for path in written)}.",
+            f"To read it: {out / 'results.html'}",
+        ],
+    )
+
+
+def _summary(results: Json, dataset: str) -> Table:
+    rows = [row for row in results["rows"] if row["dataset"] == dataset]
+    counts = f"{rows[0]['n_genuine']} genuine and {rows[0]['n_impostor']} impostor pairs"
+    return Table(f"{dataset}: {counts}", *row_cells(rows, details=False))
 
 
 def _rates(text: str) -> tuple[float, ...]:

@@ -1,24 +1,22 @@
 """``veilface evaluate liveness``: what the liveness graphs of a pack detect, and what not."""
 
-import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from api.cli.console import demo_notice, emit, message, progress, say, show, table
+from api.cli.console import demo_notice, message, progress
 from api.cli.descriptors import BULK, bulk_pack
 from api.cli.errors import CommandError, UsageError, require_extra
-from api.cli.html_report import write_html
+from api.cli.evaluation_report import LIVENESS_CAPTIONS, write_results
 from api.cli.inputs import listed, load_decoys
-from api.cli.options import AsJson, takes_settings
+from api.cli.results import Result, Table, reports
 from api.service.opening import file_sealer, open_keyring
 from api.settings import Settings
 from attacks.impostor_presentations import verify_presentations
 from models.liveness import PassiveLiveness
 from models.pack import ModelPack
 from templates.contract.document import Contract
-from templates.keys.private_file import replace_public
 from verify.datasets import DatasetError
 from verify.evaluation.liveness.document import (
     CONTRACT_POINT,
@@ -33,11 +31,10 @@ from verify.evaluation.liveness.verified import VerifiedSet
 from verify.evaluation.markdown_cells import interval_cell, significant
 from verify.evaluation.plan import Json
 from verify.evaluation.provenance import Model
-from verify.evaluation.tables import write_csv
 from verify.preparation import recorded_of
 
 
-@takes_settings(*BULK)
+@reports(*BULK)
 def evaluate_liveness(
     data: Annotated[
         Path,
@@ -71,8 +68,7 @@ def evaluate_liveness(
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the templates.")] = 0,
     out: Annotated[Path, typer.Option(help="Folder of the results.")] = Path("liveness"),
-    as_json: AsJson = False,
-) -> None:
+) -> Result:
     """Evaluate the pack's liveness graphs on live and attack photos (ISO/IEC 30107-3).
 
     Reports APCER for each attack species, BPCER, photos without a face and, with a contract, its
@@ -84,6 +80,9 @@ def evaluate_liveness(
     --out liveness-results`
     """
     require_extra("evaluate")
+    # Imported here: drawing loads a library that nothing else needs.
+    from verify.evaluation.figures import liveness_figure
+
     targets = listed(bpcer, float, "--bpcer", expected="rates such as 0.01,0.05")
     if not all(0 < target < 1 for target in targets):
         raise UsageError("--bpcer takes rates between 0 and 1")
@@ -116,14 +115,21 @@ def evaluate_liveness(
         refused=refused,
     )
     out.mkdir(parents=True, exist_ok=True)
-    written = _write(results, out)
+    written = write_results(
+        results, markdown(results), {"det": liveness_figure}, LIVENESS_CAPTIONS, out
+    )
     notice = demo_notice(pack.info.embedder_sha256, n=pack.info.n)
-    if as_json:
-        emit({**notice, "out": str(out), "files": [path.name for path in written], **results})
-        return
-    _show(results)
-    say(f"{out}: {', '.join(path.name for path in written)}.")
-    say(f"To read it: {out / 'results.html'}")
+    facts = results["verification"]
+    return Result(
+        {**notice, "out": out, "files": [path.name for path in written], **results},
+        [
+            _summary(results),
+            *([] if facts["measured"] else [f"IAPMR was not measured: {facts['reason']}."]),
+            *(f"Not reported: {sentence}." for sentence in refused),
+            f"{out}: {', '.join(path.name for path in written)}.",
+            f"To read it: {out / 'results.html'}",
+        ],
+    )
 
 
 def require_liveness(pack: ModelPack) -> PassiveLiveness:
@@ -217,41 +223,19 @@ def _verified(
     return verified, None
 
 
-def _write(results: Json, out: Path) -> list[Path]:
-    # Imported here: drawing loads a library that nothing else needs.
-    from verify.evaluation.figures import liveness_figure
-    from verify.evaluation.figures.style import write
-
-    files = [out / "results.json", out / "results.csv", out / "results.md"]
-    text = json.dumps(results, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
-    replace_public(files[0], text.encode())
-    write_csv(results["rows"], files[1])
-    report = markdown(results)
-    replace_public(files[2], report.encode())
-    figures = write(liveness_figure(results), out, "det")
-    captions = {"det": "Attacks taken for live over live photos taken for attacks (DET)"}
-    return [*files, *figures, write_html(out / "results.html", report, figures, captions)]
-
-
-def _show(results: Json) -> None:
+def _summary(results: Json) -> Table:
     dataset = results["dataset"]
-    listing = table(
+    return Table(
         f"{dataset['name']}: {dataset['live']} live photos, "
         f"{sum(dataset['attacks'].values())} attacks",
-        *("threshold of", "threshold", "species", "APCER %", "BPCER %", "IAPMR %"),
+        ("threshold of", "threshold", "species", "APCER %", "BPCER %", "IAPMR %"),
+        [
+            (
+                row["operating_point"],
+                significant(row["threshold"]),
+                row["species"] + (" (worst)" if row["worst"] else ""),
+                *(interval_cell(row[name]) for name in ("apcer", "bpcer", "iapmr")),
+            )
+            for row in results["rows"]
+        ],
     )
-    for row in results["rows"]:
-        listing.add_row(
-            row["operating_point"],
-            significant(row["threshold"]),
-            row["species"] + (" (worst)" if row["worst"] else ""),
-            interval_cell(row["apcer"]),
-            interval_cell(row["bpcer"]),
-            interval_cell(row["iapmr"]),
-        )
-    show(listing)
-    facts = results["verification"]
-    if not facts["measured"]:
-        say(f"IAPMR was not measured: {facts['reason']}.")
-    for sentence in results["refused"]:
-        say(f"Not reported: {sentence}.")

@@ -1,61 +1,59 @@
-"""What ``veilface evaluate`` writes and shows."""
+"""What ``veilface evaluate`` and ``veilface evaluate liveness`` write."""
 
 import json
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from rich.table import Table
-
-from api.cli.console import table
 from api.cli.html_report import write_html
 from templates.keys.private_file import replace_public
-from verify.evaluation.markdown_cells import accuracy, interval_cell, percent
 from verify.evaluation.plan import Json
-from verify.evaluation.row_labels import fmr_targets, strategy_label
-from verify.evaluation.tables import markdown, write_csv
+from verify.evaluation.tables import write_csv
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 CAPTIONS = {
     "figure": "Accuracy by lifting and dimension, beside that of raw embeddings",
     "det": "False non-matches over false matches (DET)",
 }
+LIVENESS_CAPTIONS = {"det": "Attacks taken for live over live photos taken for attacks (DET)"}
 
 
-def write_results(results: Json, out: Path) -> list[Path]:
-    """Write the document, the tables, the figures and the HTML; return their files."""
+def write_results(
+    results: Json,
+    report: str,
+    drawings: Mapping[str, Callable[[Json], "Figure | None"]],
+    captions: Mapping[str, str],
+    out: Path,
+) -> list[Path]:
+    """Write the document, its rows as CSV, its report, the figures and the HTML.
+
+    Parameters
+    ----------
+    report
+        In Markdown.
+    drawings, captions
+        By the name of a figure: what draws it, None where the results have nothing for it, and
+        what it shows.
+
+    Returns
+    -------
+    The files written.
+    """
     # Imported here: drawing loads a library that nothing else needs.
-    from verify.evaluation.figures import write_figures
+    from verify.evaluation.figures.style import write
 
     text = json.dumps(results, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
     files = [out / "results.json", out / "results.csv", out / "results.md"]
-    # What an earlier run drew of other rows must not stand beside these.
-    for name in CAPTIONS:
-        for suffix in (".png", ".svg"):
-            (out / f"{name}{suffix}").unlink(missing_ok=True)
     replace_public(files[0], text.encode())
     write_csv(results["rows"], files[1])
-    report = markdown(results)
     replace_public(files[2], report.encode())
-    figures = write_figures(results, out)
-    return [*files, *figures, write_html(out / "results.html", report, figures, CAPTIONS)]
-
-
-def summary(results: Json, dataset: str) -> Table:
-    """Show the rows of one set."""
-    rows = [row for row in results["rows"] if row["dataset"] == dataset]
-    targets = fmr_targets(rows)
-    listing = table(
-        f"{dataset}: {rows[0]['n_genuine']} genuine and {rows[0]['n_impostor']} impostor pairs",
-        *("strategy", "m", "mode", "metric", "accuracy %", "EER %"),
-        *(f"FNMR % at FMR {target}" for target in targets),
-    )
-    for row in rows:
-        grid = " (grid)" if row["threshold_search"] == "grid" else ""
-        listing.add_row(
-            strategy_label(row) + grid,
-            str(row["dim"] or ""),
-            row["mode"],
-            row["metric"],
-            accuracy(row),
-            percent(row["eer"]),
-            *(interval_cell(row["fnmr_at_fmr"][target]) for target in targets),
-        )
-    return listing
+    figures = []
+    for name, draw in drawings.items():
+        # What an earlier run drew of other rows must not stand beside these.
+        for suffix in (".png", ".svg"):
+            (out / f"{name}{suffix}").unlink(missing_ok=True)
+        figure = draw(results)
+        figures += [] if figure is None else write(figure, out, name)
+    return [*files, *figures, write_html(out / "results.html", report, figures, captions)]

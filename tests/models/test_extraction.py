@@ -9,7 +9,7 @@ from PIL import Image
 from models import extraction
 from models.alignment import align, template
 from models.cache import EmbeddingCache
-from models.extraction import Extractor
+from models.extraction import Extractor, Photo
 from models.pack import ModelPack
 from tests.models.graphs import pooled, pooling_embedder, unit, write_pack
 
@@ -198,14 +198,12 @@ def test_both_kinds_at_once_are_those_of_two_packs(tmp_path, files, monkeypatch)
 
 
 def test_encoded_photos_stand_under_their_names(pack, files):
-    photos = [
-        extraction.EncodedImage(f"{i:03d}", path.read_bytes()) for i, path in enumerate(files)
-    ]
-    result = Extractor(pack).extract([*photos, extraction.EncodedImage("bad", b"x")])
+    photos = [Photo(f"{i:03d}", path.read_bytes()) for i, path in enumerate(files)]
+    result = Extractor(pack).extract([*photos, Photo("bad", b"x")])
     assert [str(path) for path in result.paths] == [photo.name for photo in photos]
     assert [(str(f.path), f.code) for f in result.failures] == [("bad", "unsupported_image")]
     np.testing.assert_array_equal(result.descriptors, Extractor(pack).extract(files).descriptors)
-    assert "data" not in repr(photos[0])
+    assert "source" not in repr(photos[0])
 
 
 def test_a_marked_face_is_aligned_by_its_marks_where_there_is_no_detector(pack, tmp_path):
@@ -214,17 +212,15 @@ def test_a_marked_face_is_aligned_by_its_marks_where_there_is_no_detector(pack, 
     Image.fromarray(photo).save(path)
     marks = template(112) * 0.9 + [40.0, 20.0]
     alone = pack.embed(align(photo, marks, size=112)[None])
-    for source in (path, extraction.EncodedImage("photo", path.read_bytes())):
+    for source in (path, path.read_bytes()):
         cache = EmbeddingCache()
-        marked = extraction.MarkedPhoto(source, marks)
-        found = Extractor(pack, cache=cache).extract([marked])
+        found = Extractor(pack, cache=cache).extract([Photo("photo", source, marks)])
         np.testing.assert_allclose(found.descriptors, alone, atol=1e-6)
         assert [path.stem for path in found.paths] == ["photo"]
         # Other marks are another face, for the cache too.
-        moved = extraction.MarkedPhoto(source, marks + 5)
-        again = Extractor(pack, cache=cache).extract([moved])
+        again = Extractor(pack, cache=cache).extract([Photo("photo", source, marks + 5)])
         assert again.cached == 0
         assert not np.allclose(again.descriptors, alone, atol=1e-3)
     # Said to be an aligned crop, it is taken as one: this one is not square.
-    told = Extractor(pack, aligned=True).extract([extraction.MarkedPhoto(path, marks)])
+    told = Extractor(pack, aligned=True).extract([Photo("photo", path, marks)])
     assert [failure.code for failure in told.failures] == ["unsupported_image"]

@@ -3,7 +3,7 @@
 import hashlib
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from models.cache import EmbeddingCache
 from models.decoding import image_size
-from models.extraction import Extractor, Failure, named
+from models.extraction import Extractor, Failure
 from models.pack import ModelPack
 from verify.evaluation.embeddings_file import EmbeddingsFile, match
 from verify.evaluation.plan import EvaluationError, Json
 from verify.evaluation.provenance import Model
-from verify.evaluation.verification_set import Indices, Picture, VerificationSet
+from verify.evaluation.verification_set import Indices, VerificationSet
 
 Advance = Callable[[int], None]
 Progress = Callable[[str, int], AbstractContextManager[Advance]]
@@ -118,26 +118,26 @@ class PackEmbedder:
         """
         contents = digests(pairs)
         aligned = self._aligned(pairs)
-        first_of: dict[str, Picture] = {}
-        for picture, content in zip(pairs.pictures, contents, strict=True):
-            if content:
-                first_of.setdefault(content, picture)
+        # By content, so that copies are embedded once.
+        photos = {
+            content: replace(picture, name=content)
+            for picture, content in zip(pairs.pictures, contents, strict=True)
+            if content
+        }
         extractor = Extractor(self.pack, aligned=aligned, cache=cache, mirrored=self.mirrored)
-        sources = [picture.source for picture in first_of.values()]
-        with progress(f"embedding {pairs.name}", len(sources)) as advance:
-            extraction = extractor.extract(sources, progress=advance)
-        row_of = {str(path): row for row, path in enumerate(extraction.paths)}
-        reason_of = {str(failure.path): failure for failure in extraction.failures}
+        with progress(f"embedding {pairs.name}", len(photos)) as advance:
+            extraction = extractor.extract(photos.values(), progress=advance)
+        row_of = {path.name: row for row, path in enumerate(extraction.paths)}
+        reason_of = {failure.path.name: failure for failure in extraction.failures}
         reason_of[""] = Failure(Path(), "unreadable_file", "The file cannot be read.")
-        names = [str(named(first_of[content].source)) if content else "" for content in contents]
         return EmbeddedSet(
             pairs,
             extraction.descriptors,
-            np.array([row_of.get(name, -1) for name in names], dtype=np.int64),
+            np.array([row_of.get(content, -1) for content in contents], dtype=np.int64),
             tuple(
-                Failure(Path(picture.name), reason_of[name].code, reason_of[name].reason)
-                for picture, name in zip(pairs.pictures, names, strict=True)
-                if name not in row_of
+                replace(reason_of[content], path=Path(picture.name))
+                for picture, content in zip(pairs.pictures, contents, strict=True)
+                if content not in row_of
             ),
             extraction.mirrored,
             aligned,

@@ -1,4 +1,4 @@
-"""`results.json` as a flat CSV and as a report in Markdown."""
+"""What an evaluation found: cells of a table, a flat CSV, and a report in Markdown."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -20,7 +20,6 @@ from verify.evaluation.markdown_cells import (
 from verify.evaluation.row_labels import (
     METRIC_NAMES,
     MODE_NAMES,
-    RAW,
     Row,
     datasets_of,
     fmr_targets,
@@ -33,7 +32,10 @@ HASH_DIGITS = 12
 INTERVALS = {"subject-bootstrap": "bootstrap by subject", "pair-bootstrap": "bootstrap of pairs"}
 # A spreadsheet runs what begins so; after an apostrophe it is text.
 _FORMULAS = ("=", "+", "-", "@", "\t", "\r")
-_LEFT = ("strategy", "threshold search", "metric", "matching")
+
+Column = tuple[str, Callable[[Row], str]]
+Cells = tuple[list[str], list[list[str]]]
+"""Titles, and a line for each row."""
 
 
 def write_csv(rows: Sequence[Mapping[str, Any]], path: Path | str) -> None:
@@ -70,8 +72,52 @@ def _inert(value: Any) -> Any:
     return f"'{value}" if isinstance(value, str) and value.startswith(_FORMULAS) else value
 
 
+_NAMES: list[Column] = [
+    ("strategy", lambda row: plain(strategy_label(row) + _search(row))),
+    ("m", lambda row: str(row["dim"]) if row["dim"] else MISSING),
+    ("matching", lambda row: MODE_NAMES[row["mode"]]),
+    ("metric", lambda row: METRIC_NAMES[row["metric"]]),
+]
+_DETAILS: list[Column] = [
+    ("AUC", lambda row: fixed(row["auc"], 5)),
+    ("d'", lambda row: fixed(row["d_prime"], 2)),
+    ("collision floor %", lambda row: percent(row["collision_floor"])),
+    ("collisions", lambda row: fixed(row["collisions_mean"], 1)),
+    ("runs", lambda row: str(row["runs"])),
+    ("template bytes", lambda row: count(row["template_bytes"])),
+]
+
+
+def row_cells(rows: Sequence[Row], *, details: bool) -> Cells:
+    """Say what was compared, its accuracy and its error rates; with details everything else."""
+    targets = [
+        (f"FNMR % at FMR {power(target)}", lambda row, t=target: _fnmr(row, t))
+        for target in fmr_targets(rows)
+    ]
+    columns = [
+        *_NAMES,
+        ("accuracy %", accuracy),
+        ("EER %", lambda row: percent(row["eer"])),
+        *targets,
+        *(_DETAILS if details else []),
+    ]
+    return _cells(columns, rows)
+
+
+def _search(row: Row) -> str:
+    return " (grid)" if row.get("threshold_search") == "grid" else ""
+
+
+def _fnmr(row: Row, target: str) -> str:
+    return interval_cell(row["fnmr_at_fmr"].get(target))
+
+
+def _cells(columns: Sequence[Column], rows: Sequence[Row]) -> Cells:
+    return [title for title, _ in columns], [[cell(row) for _, cell in columns] for row in rows]
+
+
 def markdown(results: Mapping[str, Any]) -> str:
-    """Return the report: where the numbers come from, then tables for each data set.
+    """Return the report: where the numbers come from, then what each data set shows.
 
     It has no date, so that the same run gives the same text.
     """
@@ -79,13 +125,14 @@ def markdown(results: Mapping[str, Any]) -> str:
     parts = [f"# Face verification: {', '.join(map(plain, names))}", _provenance(results)]
     for dataset in results["datasets"]:
         name = dataset["name"]
-        parts += [f"## {plain(name)}", *_dataset(dataset)]
-        rows = sorted((row for row in results["rows"] if row["dataset"] == name), key=order_of)
-        for title, chosen, extra in _kinds(rows):
-            if chosen:
-                parts += [f"### {title}", _counts(chosen), _row_table(chosen, extra)]
-        summaries = [entry for entry in results["group_summaries"] if entry["dataset"] == name]
-        groups = [entry for entry in results["groups"] if entry["dataset"] == name]
+        rows, summaries, groups = (
+            sorted(
+                (row for row in results[part] if row["dataset"] == dataset["name"]), key=order_of
+            )
+            for part in ("rows", "group_summaries", "groups")
+        )
+        parts += [f"## {plain(name)}", *_dataset(dataset, rows)]
+        parts.append(_table(*row_cells(rows, details=True)))
         if groups:
             parts += ["### By group", GROUPS, *_group_tables(groups, summaries)]
     if results["refused"]:
@@ -93,6 +140,11 @@ def markdown(results: Mapping[str, Any]) -> str:
         parts.append("\n".join(f"- {plain(sentence)}" for sentence in results["refused"]))
     parts.append(HOW_TO_READ)
     return "\n\n".join(parts) + "\n"
+
+
+def _table(titles: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
+    left = {title for title, _ in _NAMES} - {"m"}
+    return table(titles, lines, [title in left for title in titles])
 
 
 HOW_TO_READ = """## How to read this
@@ -106,23 +158,16 @@ HOW_TO_READ = """## How to read this
 
 def _provenance(results: Row) -> str:
     model = results["model"]
-    kind, source = ("Model pack", model.get("pack")) if "pack" in model else ("Embeddings", None)
+    source = plain(model.get("pack") or model.get("embeddings"))
     sha256 = model.get("embedder_sha256") or model.get("sha256")
-    source = source or model.get("embeddings")
-    lines = [f"{kind}: {plain(source)}, n = {model['n']}, SHA-256 {_short(sha256)}"]
-    if results["options"].get("flip"):
-        lines.append("Embeddings: of the photo and its mirror image, summed")
-    for decoys in results["decoys"]:
-        facts = [plain(decoys["kind"]), code(decoys["file"])]
-        if decoys["entries"] is not None:
-            facts.append(f"{count(decoys['entries'])} entries")
-            facts.append("labelled" if decoys["labelled"] else "not labelled")
-        lines.append(f"Decoys: {', '.join(facts)}, SHA-256 {_short(decoys['sha256'])}")
+    flip = ", of the photo and its mirror image" if results["options"].get("flip") else ""
+    lines = [f"Embeddings: {source}, n = {model['n']}, SHA-256 {_short(sha256)}{flip}"]
+    lines += [
+        f"Decoys: {code(decoys['file'])}, {_decoys(decoys)}, SHA-256 {_short(decoys['sha256'])}"
+        for decoys in results["decoys"]
+    ]
     seeds = range(results["seed"], results["seed"] + results["repeats"])
     lines.append(f"Seeds: {', '.join(map(str, seeds))}")
-    contracts = {row["contract_id"] for row in results["rows"] if row["contract_id"]}
-    if contracts:
-        lines.append(f"Contracts: {', '.join(map(_short, sorted(contracts)))}")
     software = results["software"].items()
     lines.append("Software: " + ", ".join(f"{plain(k)} {plain(v)}" for k, v in software))
     return "\n".join(f"- {line}" for line in lines)
@@ -132,28 +177,30 @@ def _short(sha256: str | None) -> str:
     return code((sha256 or "")[:HASH_DIGITS])
 
 
-def _dataset(dataset: Row) -> list[str]:
-    facts = [f"{count(dataset['images'])} photos"]
-    if dataset["people"] is not None:
-        facts.append(f"{count(dataset['people'])} people")
-    facts.append(
-        f"{count(dataset['pairs'])} pairs ({count(dataset['genuine'])} genuine, "
-        f"{count(dataset['impostor'])} impostor)"
-    )
-    if dataset["aligned"] is not None:
-        facts.append("aligned crops" if dataset["aligned"] else "detected and aligned here")
+def _decoys(decoys: Row) -> str:
+    entries = "" if decoys["entries"] is None else f" of {count(decoys['entries'])} entries"
+    return plain(decoys["kind"]) + entries + (", labelled" if decoys.get("labelled") else "")
+
+
+def _dataset(dataset: Row, rows: Sequence[Row]) -> list[str]:
+    aligned = {None: "", True: ", aligned crops", False: ", detected and aligned here"}
+    people = "" if dataset["people"] is None else f", {count(dataset['people'])} people"
     hashed = [("photos", dataset["pictures_sha256"])]
     hashed += [(code(name), sha256) for name, sha256 in dataset["protocol_files"]]
-    sums = ", ".join(f"{name} {_short(sha256)}" for name, sha256 in hashed if sha256)
-    lines = [", ".join(facts) + (f"; SHA-256: {sums}." if sums else ".")]
+    lines = [
+        f"{count(dataset['images'])} photos{people}{aligned[dataset['aligned']]}; "
+        f"{count(rows[0]['n_genuine'])} genuine and {count(rows[0]['n_impostor'])} impostor "
+        f"comparisons of {count(dataset['pairs'])} pairs.",
+        "SHA-256: " + ", ".join(f"{name} {_short(sha256)}" for name, sha256 in hashed if sha256),
+    ]
+    kinds = {INTERVALS[at["interval"]] for row in rows for at in row["fnmr_at_fmr"].values()}
+    lines += [f"Intervals: {kind}." for kind in kinds]
     for decoys in dataset["decoys"]:
-        used = [plain(decoys["kind"])]
-        if decoys["entries"] is not None:
-            used.append(f"{count(decoys['entries'])} entries used")
-        if decoys["left_out"]:
-            left_out = count(decoys["left_out"])
-            used.append(f"{left_out} left out because they resemble people of this set")
-        lines.append(f"Decoys: {', '.join(used)}; source {_short(decoys['source_id'])}.")
+        left_out = decoys["left_out"]
+        lines.append(
+            f"Decoys used: {_decoys(decoys)}, source {_short(decoys['source_id'])}"
+            + (f"; {count(left_out)} left out that resemble people of this set" if left_out else "")
+        )
     lines += [f"Note: {plain(note)}" for note in dataset["notes"]]
     failures = dataset["failures"]
     if not failures:
@@ -177,77 +224,6 @@ def failure_list(failures: Sequence[Row]) -> str:
     return "\n".join(listed)
 
 
-Column = tuple[str, Callable[[Row], str]]
-_NAMES: list[Column] = [
-    ("strategy", lambda row: plain(strategy_label(row))),
-    ("m", lambda row: str(row["dim"]) if row["dim"] else MISSING),
-    ("matching", lambda row: MODE_NAMES[row["mode"]]),
-    ("metric", lambda row: METRIC_NAMES[row["metric"]]),
-]
-
-
-def _kinds(rows: Sequence[Row]) -> list[tuple[str, list[Row], list[Column]]]:
-    """Return the tables of a data set: title, rows, columns that only this table has."""
-    search: Column = ("threshold search", lambda row: plain(row["threshold_search"]))
-    floor: Column = ("collision floor %", lambda row: percent(row["collision_floor"]))
-    raw = [row for row in rows if row["strategy"] in RAW]
-    points, spaces = ([row for row in rows if row["mode"] == mode] for mode in ("p2s", "s2s"))
-    return [
-        ("Raw embeddings", raw, [search]),
-        ("Point to subspace (p-to-s)", points, [_NAMES[1]]),
-        (
-            "Subspace to subspace (s-to-s)",
-            spaces,
-            [_NAMES[1], floor, ("collisions seen", _collisions)],
-        ),
-    ]
-
-
-def _collisions(row: Row) -> str:
-    seen = f"{row['collisions_mean']:,.1f}".removesuffix(".0")
-    return f"{seen} of {count(row['n_impostor'])}"
-
-
-def _counts(rows: Sequence[Row]) -> str:
-    """Say what all rows share: trials, runs, kind of interval."""
-    runs = sorted({row["runs"] for row in rows})
-    parts = [
-        f"{count(rows[0]['n_genuine'])} genuine and {count(rows[0]['n_impostor'])} impostor "
-        "comparisons",
-        f"mean of {' or '.join(map(str, runs))} run{'s' if runs != [1] else ''}",
-    ]
-    cells = [cell for row in rows for cell in row["fnmr_at_fmr"].values()]
-    if cells:
-        parts.append(f"intervals: {INTERVALS[cells[0]['interval']]}")
-    return "; ".join(parts) + "."
-
-
-def _row_table(rows: Sequence[Row], extra: Sequence[Column]) -> str:
-    columns = [
-        _NAMES[0],
-        extra[0],
-        _NAMES[3],
-        ("accuracy %", accuracy),
-        ("EER %", lambda row: percent(row["eer"])),
-        *((f"FNMR % at FMR {power(target)}", _rate_column(target)) for target in fmr_targets(rows)),
-        ("AUC", lambda row: fixed(row["auc"], 5)),
-        ("d'", lambda row: fixed(row["d_prime"], 2)),
-        *extra[1:],
-        ("template bytes", lambda row: count(row["template_bytes"])),
-    ]
-    return _table(columns, rows)
-
-
-def _rate_column(target: str) -> Callable[[Row], str]:
-    return lambda row: interval_cell(row["fnmr_at_fmr"].get(target))
-
-
-def _table(columns: Sequence[Column], rows: Sequence[Row]) -> str:
-    titles = [title for title, _ in columns]
-    lines = [[cell(row) for _, cell in columns] for row in rows]
-    return table(titles, lines, [title in _LEFT for title in titles])
-
-
 FEW = "*"
 GROUPS = (
     "FMR and FNMR in each group at the one threshold that holds for all; errors are means over "
@@ -262,28 +238,25 @@ def _group_tables(groups: Sequence[Row], summaries: Sequence[Row]) -> list[str]:
     """Return one table for each attribute and FMR target of one data set."""
     parts = []
     for attribute, target in dict.fromkeys(map(_judged_at, groups)):
-        parts.append(f"**{plain(attribute)}, threshold at FMR {power(target)}**")
         own = [group for group in groups if _judged_at(group) == (attribute, target)]
         lines = [
-            {
-                **summary,
-                "groups": {g["group"]: g for g in own if order_of(g) == order_of(summary)},
-            }
-            for summary in sorted(summaries, key=order_of)
+            {**summary, "groups": {g["group"]: g for g in own if order_of(g) == order_of(summary)}}
+            for summary in summaries
             if _judged_at(summary) == (attribute, target)
         ]
-        columns = [
+        columns: list[Column] = [
             *_NAMES,
             ("worst FMR %", lambda row: _worst(row["worst_fmr"])),
             ("× mean", lambda row: fixed(row["fmr_ratio"], 2)),
             ("worst FNMR %", lambda row: _worst(row["worst_fnmr"])),
             ("× mean", lambda row: fixed(row["fnmr_ratio"], 2)),
+            *(
+                (f"{plain(name)}: FMR / FNMR %", lambda row, n=name: _group_cell(row["groups"][n]))
+                for name in dict.fromkeys(group["group"] for group in own)
+            ),
         ]
-        columns += [
-            (f"{plain(name)}: FMR / FNMR %", _group_column(name))
-            for name in dict.fromkeys(group["group"] for group in own)
-        ]
-        parts.append(_table(columns, lines))
+        title = f"**{plain(attribute)}, threshold at FMR {power(target)}**"
+        parts += [title, _table(*_cells(columns, lines))]
     return parts
 
 
@@ -297,12 +270,8 @@ def _worst(worst: Row | None) -> str:
     return f"{plain(worst['group'])}: {interval_cell(worst)}{' apart' if worst['apart'] else ''}"
 
 
-def _group_column(name: str) -> Callable[[Row], str]:
-    def cell(row: Row) -> str:
-        rates = (row["groups"][name][kind] for kind in ("fmr", "fnmr"))
-        return " / ".join(
-            percent(rate["value"]) + ("" if rate["judged"] or not rate["trials"] else FEW)
-            for rate in rates
-        )
-
-    return cell
+def _group_cell(group: Row) -> str:
+    return " / ".join(
+        percent(rate["value"]) + ("" if rate["judged"] or not rate["trials"] else FEW)
+        for rate in (group["fmr"], group["fnmr"])
+    )

@@ -1,67 +1,17 @@
 """Pairs of photos to verify, in the order of their protocol, whatever it was read from."""
 
 import hashlib
-from dataclasses import dataclass, field
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from models.decoding import DEFAULT_LIMITS
-from models.extraction import EncodedImage, MarkedPhoto
+from models.extraction import Photo
 from verify.datasets import DatasetError
 from verify.tenfold import FOLDS
 
 Indices = NDArray[np.int64]
 Flags = NDArray[np.bool_]
-
-
-@dataclass(frozen=True)
-class PictureFile:
-    """A photo in a folder.
-
-    Parameters
-    ----------
-    name
-        Path relative to the set; unique in it.
-    keypoints : (5, 2) float64, optional
-        Points of the face that the set offers, for packs without a detector.
-    """
-
-    name: str
-    path: Path
-    keypoints: NDArray[np.float64] | None = field(default=None, repr=False, compare=False)
-
-    @property
-    def source(self) -> Path | MarkedPhoto:
-        """The photo as bulk extraction takes it; the file is not read yet."""
-        return self.path if self.keypoints is None else MarkedPhoto(self.path, self.keypoints)
-
-    def read(self) -> bytes:
-        """Read the file, and one byte more than the decoder accepts where it is larger."""
-        with self.path.open("rb") as file:
-            return file.read(DEFAULT_LIMITS.max_bytes + 1)
-
-
-@dataclass(frozen=True)
-class PictureBytes:
-    """A photo inside a larger file, where it is an aligned crop; named by its place in it."""
-
-    name: str
-    data: bytes = field(repr=False)
-    keypoints: None = None
-
-    @property
-    def source(self) -> EncodedImage:
-        """The bytes under the photo's name."""
-        return EncodedImage(self.name, self.data)
-
-    def read(self) -> bytes:
-        """Return the bytes."""
-        return self.data
-
-
-Picture = PictureFile | PictureBytes
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -96,7 +46,7 @@ class VerificationSet:
 
     name: str
     kind: str
-    pictures: tuple[Picture, ...]
+    pictures: tuple[Photo, ...]
     first: Indices
     second: Indices
     same: Flags

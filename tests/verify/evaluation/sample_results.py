@@ -24,7 +24,6 @@ def sample_results(
     dims: Sequence[int] = (2, 4, 8, 16),
     modes: Sequence[str] = ("p2s", "s2s"),
     metrics: Sequence[str] = ("euclidean", "spherical"),
-    groups: bool = False,
     shared: Sequence[bool] = (False,),
     failures: int = 2,
     seed: int = 0,
@@ -54,7 +53,6 @@ def sample_results(
                                 row["collision_floor"] = dim**2 / 5000 if sharing else 0.0
                                 row["collisions_mean"] = float(rng.integers(0, 5) * dim / 4)
                             rows.append(row)
-    made = _groups(rng, rows) if groups else ([], [])
     return {
         "format": "veilface evaluation",
         "version": 1,
@@ -70,17 +68,11 @@ def sample_results(
         "datasets": [_dataset(name, failures) for name in datasets],
         "rows": rows,
         "runs": [{"dataset": datasets[0], "mode": "p2s", "seed": s} for s in (0, 1, 2)],
-        "groups": made[0],
-        "group_summaries": made[1],
+        "groups": [],
+        "group_summaries": [],
         "curves": [_curve(rng, row) for row in rows if row["threshold_search"] == "exact"],
         "refused": ["FMR 1e-4 on lfw: 3,000 impostor pairs resolve 1e-3."],
     }
-
-
-def _leak(strategy: str, dim: int) -> float:
-    if strategy.startswith(("raw", "random")):
-        return 0.6
-    return 0.5 / np.log2(dim + 2) * (1.3 if strategy.startswith("hybrid") else 1.0)
 
 
 def _row(
@@ -172,31 +164,3 @@ def _curve(rng: np.random.Generator, row: dict[str, Any]) -> dict[str, Any]:
         "high": np.minimum(1, fnmr * 1.4).tolist(),
         "interval": "subject-bootstrap",
     }
-
-
-def _groups(
-    rng: np.random.Generator, rows: Sequence[dict[str, Any]]
-) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    names = ("dataset", "strategy", "decoys", "shared_decoys", "dim", "mode", "metric")
-    groups, summaries = [], []
-    for row in rows:
-        if row["threshold_search"] != "exact":
-            continue
-        head = {name: row[name] for name in names}
-        head |= {"seed": 0, "attribute": "gender", "target_fmr": 0.01, "threshold": 0.2, "runs": 3}
-        both: dict[str, Any] = {}
-        for group in ("Female", "Male"):
-            rates: dict[str, Any] = {}
-            for rate, mean in (("fmr", 0.01), ("fnmr", row["eer"])):
-                errors = int(rng.poisson(mean * 1400))
-                rates[rate] = {"value": errors / 1400, "errors": errors, "trials": 1400}
-                rates[rate] |= {"ci_low": errors / 2000, "ci_high": errors / 1000, "judged": True}
-            groups.append(head | {"group": group} | rates)
-            both[group] = rates
-        summary = dict(head)
-        for rate in ("fmr", "fnmr"):
-            worst = max(both, key=lambda name: float(both[name][rate]["value"]))
-            summary[f"worst_{rate}"] = {"group": worst, "apart": False} | both[worst][rate]
-            summary[f"{rate}_ratio"] = 1.25
-        summaries.append(summary)
-    return groups, summaries

@@ -8,6 +8,7 @@ import pytest
 from models.cache import EmbeddingCache
 from models.decoding import decode_image
 from models.demo import build_demo_pack
+from models.extraction import Photo
 from models.pack import ModelPack
 from models.synthetic import draw_face, encode_photo
 from verify.evaluation.embedding import (
@@ -19,13 +20,7 @@ from verify.evaluation.embedding import (
     digests,
 )
 from verify.evaluation.embeddings_file import EmbeddingsFile
-from verify.evaluation.verification_set import (
-    Picture,
-    PictureBytes,
-    PictureFile,
-    VerificationSet,
-    contiguous_folds,
-)
+from verify.evaluation.verification_set import VerificationSet, contiguous_folds
 
 
 @contextmanager
@@ -37,7 +32,7 @@ BROKEN = b"\x89PNG\r\n\x1a\nnot a photo"
 FACES = [encode_photo(draw_face(number)) for number in range(6)]
 
 
-def verification_set(pictures: Sequence[Picture]) -> VerificationSet:
+def verification_set(pictures: Sequence[Photo]) -> VerificationSet:
     """Every picture in one pair, genuine and impostor in turn."""
     first = np.arange(0, len(pictures) - 1, dtype=np.int64)
     return VerificationSet(
@@ -63,15 +58,15 @@ def mixed(tmp_path: Path) -> VerificationSet:
         (tmp_path / f"{number}.png").write_bytes(FACES[number])
     return verification_set(
         [
-            PictureFile("Ann/0.png", tmp_path / "0.png"),
-            PictureBytes("broken", BROKEN),
-            PictureBytes("copy of 0", FACES[0]),
-            PictureFile("Bob/1.png", tmp_path / "1.png"),
-            PictureBytes("broken too", BROKEN),
-            PictureBytes("2", FACES[2]),
-            PictureBytes("copy of 2", FACES[2]),
-            PictureFile("Cas/3.png", tmp_path / "absent.png"),
-            PictureFile("Cas/4.png", tmp_path / "absent too.png"),
+            Photo("Ann/0.png", tmp_path / "0.png"),
+            Photo("broken", BROKEN),
+            Photo("copy of 0", FACES[0]),
+            Photo("Bob/1.png", tmp_path / "1.png"),
+            Photo("broken too", BROKEN),
+            Photo("2", FACES[2]),
+            Photo("copy of 2", FACES[2]),
+            Photo("Cas/3.png", tmp_path / "absent.png"),
+            Photo("Cas/4.png", tmp_path / "absent too.png"),
         ]
     )
 
@@ -125,7 +120,7 @@ def test_equal_pictures_are_embedded_once(pack: ModelPack, monkeypatch: pytest.M
     monkeypatch.setattr(ModelPack, "embed", counted)
     # Copies far apart, so that they would be in different chunks.
     monkeypatch.setattr("models.extraction.CHUNK", 2)
-    pairs = verification_set([PictureBytes(f"{i}", FACES[i % 3]) for i in range(12)])
+    pairs = verification_set([Photo(f"{i}", FACES[i % 3]) for i in range(12)])
     found = acquired(pairs, pack)
     assert sum(given) == 3
     np.testing.assert_array_equal(found.rows, np.arange(12) % 3)
@@ -162,7 +157,7 @@ def test_digests_tell_contents_apart(mixed: VerificationSet) -> None:
 def test_photos_that_a_file_of_embeddings_lacks_failed_to_acquire() -> None:
     rows = np.eye(4, dtype=np.float32)
     embeddings = EmbeddingsFile(("c.png", "x.png", "a.png", "y.png"), rows, "0" * 64)
-    pairs = verification_set([PictureBytes(f"{name}.png", b"") for name in "abcd"])
+    pairs = verification_set([Photo(f"{name}.png", b"") for name in "abcd"])
     embedder = FileEmbedder(embeddings, "own.npz")
     found = embedder.embed(pairs, cache=None, progress=no_progress)
     np.testing.assert_array_equal(found.rows, [0, -1, 1, -1])
@@ -174,10 +169,10 @@ def test_photos_that_a_file_of_embeddings_lacks_failed_to_acquire() -> None:
 
 
 def test_photos_are_aligned_where_all_have_the_size_of_the_embedder(tmp_path: Path) -> None:
-    small = [PictureBytes(f"{i}", face) for i, face in enumerate(FACES)]
-    photo = PictureBytes("photo", encode_photo(draw_face(1, size=250)))
-    broken = PictureBytes("broken", BROKEN)
-    absent = PictureFile("absent", tmp_path / "absent.png")
+    small = [Photo(f"{i}", face) for i, face in enumerate(FACES)]
+    photo = Photo("photo", encode_photo(draw_face(1, size=250)))
+    broken = Photo("broken", BROKEN)
+    absent = Photo("absent", tmp_path / "absent.png")
     assert are_aligned(verification_set(small), 112)
     assert not are_aligned(verification_set(small), 128)
     assert not are_aligned(verification_set([*small, photo]), 112)

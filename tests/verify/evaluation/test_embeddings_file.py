@@ -11,11 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from models.extraction import Photo
 from tests.verify.evaluation.layouts import cfp_folder, lfw_folder, write
 from verify import DatasetError
 from verify.evaluation.embeddings_file import EmbeddingsFile, match, read_embeddings
 from verify.evaluation.readers import open_sets
-from verify.evaluation.verification_set import PictureBytes, VerificationSet
+from verify.evaluation.verification_set import VerificationSet
 
 pytestmark = pytest.mark.usefixtures("in_this_process")
 
@@ -30,7 +31,7 @@ def embeddings(paths: Sequence[str]) -> EmbeddingsFile:
 
 def benchmark(kind: str, names: Sequence[str]) -> VerificationSet:
     none = np.zeros(0, dtype=np.int64)
-    pictures = tuple(PictureBytes(name, b"") for name in names)
+    pictures = tuple(Photo(name, b"") for name in names)
     return VerificationSet(kind, kind, pictures, none, none, none.astype(bool), none)
 
 

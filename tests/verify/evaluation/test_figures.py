@@ -12,9 +12,10 @@ import pytest
 from PIL import Image
 
 from tests.verify.evaluation.sample_results import sample_results
-from verify.evaluation.figures import write_figures
+from verify.evaluation.figures import det_figure, verification_figure
 from verify.evaluation.figures.bars import MODE_TITLES
 from verify.evaluation.figures.det import shown_curves
+from verify.evaluation.figures.style import write
 
 PAPER = (("random", None), ("adversarial", "pool"), ("hybrid", "pool"))
 
@@ -44,7 +45,11 @@ def test_files_are_complete_readable_and_the_same_each_time(tmp_path: Path, mode
     before = matplotlib.rcParams["font.size"]
     for folder in ("one", "two"):
         (tmp_path / folder).mkdir()
-        paths = write_figures(results, tmp_path / folder)
+        paths = [
+            path
+            for name_of, draw in (("figure", verification_figure), ("det", det_figure))
+            for path in write(draw(results), tmp_path / folder, name_of)
+        ]
     assert matplotlib.rcParams["font.size"] == before
     assert [path.name for path in paths] == ["figure.png", "figure.svg", "det.png", "det.svg"]
     for path in paths:
@@ -66,15 +71,15 @@ def test_files_are_complete_readable_and_the_same_each_time(tmp_path: Path, mode
     assert not re.search(r"20\d\d-\d\d-\d\d", paths[1].read_text(encoding="utf-8"))
 
 
-def test_a_figure_without_content_is_left_out(tmp_path: Path) -> None:
+def test_a_figure_without_content_is_left_out() -> None:
     only_raw = sample_results(liftings=())
-    assert [path.name for path in write_figures(only_raw, tmp_path)] == ["det.png", "det.svg"]
-    only_raw["curves"] = []
-    assert write_figures(only_raw, tmp_path) == []
+    assert verification_figure(only_raw) is None
+    assert det_figure(only_raw) is not None
+    assert det_figure(only_raw | {"curves": []}) is None
     without_folds = sample_results(liftings=PAPER, dims=(2,))
     for row in without_folds["rows"]:
         row |= dict.fromkeys(("accuracy_mean", "accuracy_std", "threshold_mean", "thresholds"))
-    assert len(write_figures(without_folds, tmp_path)) == 2
+    assert verification_figure(without_folds) is None
 
 
 def test_only_the_figures_import_matplotlib_and_never_pyplot() -> None:

@@ -18,7 +18,7 @@ from tests.verify.evaluation.layouts import (
 from verify import DatasetError, labelled_folder, read_lfw_pairs
 from verify.evaluation.readers import notes, open_sets
 from verify.evaluation.readers.agedb import PROTOCOL, read_content, read_pts
-from verify.evaluation.verification_set import PictureFile, VerificationSet
+from verify.evaluation.verification_set import VerificationSet
 from verify.tenfold import FOLDS
 
 pytestmark = pytest.mark.usefixtures("in_this_process")
@@ -227,7 +227,6 @@ def test_agedb(tmp_path: Path, layout: str, compressed: bool) -> None:
     assert (agedb.name, agedb.kind) == ("agedb_30", "agedb")
     assert agedb.people == ("AnnBell", "AnnBell", "BobHay")
     photo = agedb.pictures[0]
-    assert isinstance(photo, PictureFile)
     marks = read_pts(tmp_path / "03_Protocol_Images" / f"{AGEDB_NAMES[0]}.pts")
     np.testing.assert_array_equal(photo.keypoints, marks)
     assert notes(agedb)[0] == "agedb_30 has 30 pairs, the published set has 6,000"

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from models.extraction import Failure
+from models.extraction import Failure, Photo
 from templates.distances import Metric
 from tests.verify.evaluation.made_trials import N, made_trials, pool
 from verify.datasets import DatasetError
@@ -29,7 +29,7 @@ from verify.evaluation.labels_file import Labels
 from verify.evaluation.plan import EvaluationPlan, Mode
 from verify.evaluation.provenance import Model
 from verify.evaluation.results import collision_floor, curve_of, document, row_of
-from verify.evaluation.verification_set import PictureBytes, VerificationSet
+from verify.evaluation.verification_set import VerificationSet
 from verify.metrics import threshold_at_fmr, wilson
 
 PLAN = EvaluationPlan(("raw", "random", "adversarial"), dims=(2, 3), repeats=2, targets=(0.1, 1e-4))
@@ -51,7 +51,7 @@ def verification_set(pairs: int = 100, people: int = 30) -> VerificationSet:
     return VerificationSet(
         name="made",
         kind="pairs",
-        pictures=tuple(PictureBytes(f"{i}", b"") for i in range(2 * people)),
+        pictures=tuple(Photo(f"{i}", b"") for i in range(2 * people)),
         first=known.first,
         second=known.second,
         same=known.same,

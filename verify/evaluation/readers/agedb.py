@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from models.extraction import Photo
 from verify.datasets import SUFFIXES, DatasetError, faults_in, read_whole
 from verify.evaluation.readers.reader import (
     Reader,
@@ -18,7 +19,7 @@ from verify.evaluation.readers.reader import (
     photos_named,
     require_plain_names,
 )
-from verify.evaluation.verification_set import PictureFile, VerificationSet, digest_of
+from verify.evaluation.verification_set import VerificationSet, digest_of
 from verify.tenfold import FOLDS
 
 PROTOCOL = "04_FINAL_protocol_30_years.mat"
@@ -49,7 +50,7 @@ def read_agedb(root: Path, pictures: bool) -> list[VerificationSet]:
     trials, sha256 = isolated(read_content, root / PROTOCOL)
     keys = keys_of(trials)
     require_plain_names(root / PROTOCOL, keys)
-    files = {key: PictureFile(f"{key}.jpg", root / f"{key}.jpg") for key in keys}
+    files = {key: Photo(f"{key}.jpg", root / f"{key}.jpg") for key in keys}
     if pictures:
         # Archives are often unpacked into a folder of their own name.
         inner = root / PHOTOS / PHOTOS
@@ -57,7 +58,7 @@ def read_agedb(root: Path, pictures: bool) -> list[VerificationSet]:
         for key, photo in photos_named(base, keys, protocol=PROTOCOL).items():
             points = photo.with_suffix(".pts")
             marks = read_pts(points) if points.is_file() else None
-            files[key] = PictureFile(photo.name, photo, marks)
+            files[key] = Photo(photo.name, photo, marks)
     return [
         assemble(
             "agedb_30",

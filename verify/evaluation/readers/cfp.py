@@ -4,6 +4,7 @@ import posixpath
 from collections.abc import Sequence
 from pathlib import Path
 
+from models.extraction import Photo
 from verify.datasets import DatasetError, faults_in, is_photo
 from verify.evaluation.readers.reader import (
     ProtocolText,
@@ -13,7 +14,7 @@ from verify.evaluation.readers.reader import (
     keys_of,
     read_text,
 )
-from verify.evaluation.verification_set import PictureFile, VerificationSet
+from verify.evaluation.verification_set import VerificationSet
 from verify.tenfold import FOLDS
 
 LIST = "Protocol/Pair_list_{}.txt"
@@ -42,7 +43,7 @@ def read_cfp(root: Path, pictures: bool) -> list[VerificationSet]:
     lists = {letter: _photo_list(text, letter) for letter, text in texts.items()}
     protocols = {split: _trials(root, split, lists) for split in ("FF", "FP")}
     keys = keys_of(trial for trials, _ in protocols.values() for trial in trials)
-    files = _files(root, keys) if pictures else {key: PictureFile(key, root / key) for key in keys}
+    files = _files(root, keys) if pictures else {key: Photo(key, root / key) for key in keys}
     return [
         assemble(
             f"cfp_{split.lower()}",
@@ -118,8 +119,8 @@ def _pair(where: str, line: str, photos: Sequence[Sequence[str]]) -> list[str]:
     return [side[int(index) - 1] for index, side in zip(indices, photos, strict=True)]
 
 
-def _files(root: Path, keys: Sequence[str]) -> dict[str, PictureFile]:
-    files = {key: PictureFile(key, root / key) for key in keys if (root / key).is_file()}
+def _files(root: Path, keys: Sequence[str]) -> dict[str, Photo]:
+    files = {key: Photo(key, root / key) for key in keys if (root / key).is_file()}
     if len(files) == len(keys):
         return files
     elsewhere: dict[tuple[str, ...], list[str]] = {}
@@ -131,7 +132,7 @@ def _files(root: Path, keys: Sequence[str]) -> dict[str, PictureFile]:
     for key in keys:
         names = [key] if key in files else elsewhere.get(tuple(key.split("/")[-3:]), [])
         if len(names) == 1:
-            files[key] = PictureFile(names[0], root / names[0])
+            files[key] = Photo(names[0], root / names[0])
         else:
             faults.append(f"{key} may be {' or '.join(names)}" if names else f"{key} is not there")
     if faults:

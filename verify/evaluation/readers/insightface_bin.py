@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from models.extraction import Photo
 from verify.datasets import DatasetError, read_whole
 from verify.evaluation.readers.reader import Reader, Trial, assemble, isolated
 from verify.evaluation.verification_set import (
-    PictureBytes,
     VerificationSet,
     contiguous_folds,
     digest_of,
@@ -48,7 +48,7 @@ def read_bin(path: Path, _: bool) -> list[VerificationSet]:
             path.stem.lower(),
             "bin",
             trials,
-            pictures={name: PictureBytes(name, photo) for photo, name in name_of.items()},
+            pictures={name: Photo(name, photo) for photo, name in name_of.items()},
             person=None,
             protocol_files=[(path.name, sha256)],
             aligned=True,

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from models.extraction import Photo
 from verify.datasets import DatasetError, parse_lfw_pairs
 from verify.evaluation.readers.reader import (
     Reader,
@@ -12,7 +13,7 @@ from verify.evaluation.readers.reader import (
     read_text,
     require_plain_names,
 )
-from verify.evaluation.verification_set import PictureFile, VerificationSet
+from verify.evaluation.verification_set import VerificationSet
 
 PAIRS = "pairs.txt"
 
@@ -37,13 +38,12 @@ def read_lfw(root: Path, pictures: bool) -> list[VerificationSet]:
     require_plain_names(root / PAIRS, people)
     trials = [Trial("/".join(one.first), "/".join(one.second), one.same, one.fold) for one in pairs]
     keys = keys_of(trials)
-    files = {key: PictureFile(f"{key}.jpg", root / f"{key}.jpg") for key in keys}
+    files = {key: Photo(f"{key}.jpg", root / f"{key}.jpg") for key in keys}
     if pictures:
         base = _photo_root(root, people)
         photos = photos_named(base, keys, protocol=PAIRS)
         files = {
-            key: PictureFile(photo.relative_to(base).as_posix(), photo)
-            for key, photo in photos.items()
+            key: Photo(photo.relative_to(base).as_posix(), photo) for key, photo in photos.items()
         }
     return [
         assemble(

@@ -6,9 +6,10 @@ import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from models.extraction import Photo
 from verify.datasets import DatasetError, faults_in, is_photo, visible
 from verify.evaluation.readers.reader import Reader, Trial, assemble, keys_of, read_text
-from verify.evaluation.verification_set import PictureFile, VerificationSet
+from verify.evaluation.verification_set import VerificationSet
 from verify.tenfold import FOLDS
 
 REQUIRED = ("path_a", "path_b", "same")
@@ -55,7 +56,7 @@ def read_pair_csv(path: Path, pictures: bool) -> list[VerificationSet]:
         folder = Path(_place(path, name))
         if folder.is_dir():
             photos = [file for file in visible(folder) if is_photo(file)]
-            templates[name] = [PictureFile(f"{name}/{file.name}", file) for file in photos]
+            templates[name] = [Photo(f"{name}/{file.name}", file) for file in photos]
     absent = [
         f"{name} is not there" if name not in templates else f"{name} holds no photo"
         for name in keys_of(trials)
@@ -68,7 +69,7 @@ def read_pair_csv(path: Path, pictures: bool) -> list[VerificationSet]:
             path.stem,
             "pairs",
             _from_zero(path, trials),
-            pictures=lambda name: PictureFile(name, Path(_place(path, name))),
+            pictures=lambda name: Photo(name, Path(_place(path, name))),
             person=people.__getitem__ if people else None,
             protocol_files=[text.fingerprint],
             templates=templates,

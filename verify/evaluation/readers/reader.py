@@ -15,6 +15,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from models.extraction import Photo
 from verify.datasets import (
     MAX_PAIRS_BYTES,
     SUFFIXES,
@@ -25,7 +26,6 @@ from verify.datasets import (
     read_whole,
 )
 from verify.evaluation.verification_set import (
-    Picture,
     VerificationSet,
     digest_of,
     require_both_classes,
@@ -185,11 +185,11 @@ def assemble(
     kind: str,
     trials: Sequence[Trial],
     *,
-    pictures: Mapping[str, Picture] | Callable[[str], Picture],
+    pictures: Mapping[str, Photo] | Callable[[str], Photo],
     person: Callable[[str], str] | None,
     protocol_files: Iterable[tuple[str, str]],
     aligned: bool | None = None,
-    templates: Mapping[str, Sequence[Picture]] | None = None,
+    templates: Mapping[str, Sequence[Photo]] | None = None,
 ) -> VerificationSet:
     """Number the photos of ``trials`` and check that every fold has both kinds of pairs.
 
@@ -215,7 +215,7 @@ def assemble(
         folds = np.array([trial.fold for trial in trials], dtype=np.int64)
     require_both_classes(name, same, folds)
     of_key = pictures if callable(pictures) else pictures.__getitem__
-    photos: list[Picture] = []
+    photos: list[Photo] = []
     members: list[tuple[int, ...]] = []
     for key in keys:
         own = (templates or {}).get(key) or [of_key(key)]
