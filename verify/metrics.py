@@ -55,12 +55,6 @@ def rate(errors: int, trials: int) -> Rate:
     return Rate(errors=errors, trials=trials, ci_low=low, ci_high=high)
 
 
-def false_non_match_rate(genuine: ArrayLike, threshold: float) -> Rate:
-    """Share of genuine similarities below the threshold."""
-    scores = np.asarray(genuine, dtype=np.float64)
-    return rate(int(np.count_nonzero(scores < threshold)), scores.size)
-
-
 def most_errors(target: float, trials: int) -> int:
     """Largest count whose rate is at most the target, free of rounding in ``target * trials``."""
     count = math.floor(target * trials)

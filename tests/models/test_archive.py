@@ -3,14 +3,13 @@
 import io
 import random
 import stat
-import struct
 import zipfile
 from pathlib import Path
 
 import pytest
 
 from models import archive
-from models.archive import is_archive, unpack
+from models.archive import unpack
 from models.errors import PackError
 
 GRAPH = b"a graph"
@@ -133,17 +132,6 @@ def test_what_is_neither_stored_nor_deflated_is_refused(tmp_path: Path, method: 
     with zipfile.ZipFile(path, "w", method) as file:
         file.writestr("det.onnx", GRAPH)
     with pytest.raises(PackError, match=r"neither stored nor deflated: det\.onnx"):
-        unpack(path, target(tmp_path))
-
-
-def test_an_archive_of_several_disks_is_one_and_is_refused(tmp_path: Path) -> None:
-    path = zipped(tmp_path, ("det.onnx", GRAPH))
-    data = path.read_bytes()
-    end = data.index(b"PK\x05\x06")
-    locator = b"PK\x06\x07" + struct.pack("<LQL", 1, end, 2)
-    path.write_bytes(data[:end] + locator + data[end:])
-    assert is_archive(path)
-    with pytest.raises(PackError, match="cannot be read"):
         unpack(path, target(tmp_path))
 
 

@@ -54,15 +54,6 @@ def test_no_embedding_lies_on_disk_in_the_clear(tmp_path):
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
 
 
-def test_in_memory_writes_nothing(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    cache = EmbeddingCache()
-    cache.put(b"k" * 32, vector(1))
-    cache.flush()
-    assert list(tmp_path.iterdir()) == []
-    np.testing.assert_array_equal(cache.get(b"k" * 32), vector(1))
-
-
 def test_a_failed_write_keeps_the_old_file_and_leaves_nothing_behind(tmp_path, monkeypatch):
     path = tmp_path / "embeddings.cache"
     cache = EmbeddingCache.open_file(path, Xor())

@@ -8,7 +8,6 @@ import numpy as np
 import onnx
 import onnxruntime as ort
 import pytest
-from scipy.ndimage import correlate
 
 from models.demo import (
     DEMO_DIMENSION,
@@ -109,32 +108,6 @@ def test_the_pack_says_what_it_is(tmp_path):
     assert onnx.load_from_string(written).doc_string == DEMO_NOTICE
     assert is_demo_model(hashlib.sha256(written).hexdigest())
     assert not is_demo_model(hashlib.sha256(b"another model").hexdigest())
-
-
-def test_features_agree_with_scipy(session):
-    """The edge features before the projection, recomputed in float64 for one cell."""
-    model = onnx.load_from_string(demo_model_bytes())
-    model.graph.output.append(
-        onnx.helper.make_tensor_value_info("features", onnx.TensorProto.FLOAT, None)
-    )
-    both = ort.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
-    image = normalised(draw_face(1, 1)[None])
-    features = both.run(["features"], {"image": image})[0][0]
-
-    luminance = np.tensordot([0.299, 0.587, 0.114], image[0].astype(np.float64), axes=1)
-    y, x = np.mgrid[-4:5, -4:5].astype(np.float64)
-    cells = np.zeros((8, 27, 27))
-    for k in range(8):
-        angle = 2 * np.pi * k / 8
-        kernel = (np.cos(angle) * x + np.sin(angle) * y) * np.exp(-(x**2 + y**2) / (2 * 1.2**2))
-        rising = np.maximum(correlate(luminance, kernel / np.abs(kernel).sum(), mode="constant"), 0)
-        for i in range(27):
-            for j in range(27):
-                cells[k, i, j] = rising[4 * i : 4 * i + 8, 4 * j : 4 * j + 8].mean()
-    energy = (cells**2).sum(axis=0)
-    around = energy[12:15, 12:15].mean()
-    expected = cells[:, 13, 13] / np.sqrt(around + 0.03**2)
-    assert np.allclose(features[:, 13, 13], expected, atol=5e-3)
 
 
 def test_embeddings_separate_drawn_people(session, faces):

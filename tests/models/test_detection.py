@@ -8,8 +8,8 @@ from PIL import Image
 from models.alignment import align
 from models.boxes import Face, ranked
 from models.decoding import decode_image
-from models.detection import RETRY_BORDER, canvas_sizes, find_faces, letterbox
-from models.detectors import YUNET_OUTPUTS, Scrfd, YuNet
+from models.detection import RETRY_BORDER, find_faces, letterbox
+from models.detectors import Scrfd, YuNet
 from models.errors import ModelError
 from models.pack import ModelPack
 from models.selection import FacePolicy
@@ -72,12 +72,6 @@ def test_letterbox_of_slivers(shape):
     canvas, _ = letterbox(np.full((*shape, 3), 7, np.uint8), (64, 64), enlarge=True)
     assert canvas.shape == (64, 64, 3)
     assert canvas[0, 0, 0] == 7
-
-
-def test_canvas_sizes():
-    assert canvas_sizes(640, None) == ((640, 640), (320, 320))
-    assert canvas_sizes(320, None) == ((320, 320),)
-    assert canvas_sizes(640, (480, 640)) == ((480, 640),)
 
 
 def scrfd_answer(hits, *, batched=False, anchors=2):
@@ -180,11 +174,6 @@ def test_yunet_decodes_centres_and_log_sides():
     )
 
 
-def test_yunet_asks_for_its_outputs_by_name():
-    assert YUNET_OUTPUTS[:3] == ("cls_8", "cls_16", "cls_32")
-    assert len(YUNET_OUTPUTS) == 12
-
-
 @pytest.mark.parametrize("shape", [(1, 1), (250, 250), (40, 4000), (3000, 2000), (641, 640)])
 def test_yunet_canvas_is_whole_blocks_and_bounded(shape):
     size = YuNet(Replay(None)).canvas(np.zeros((*shape, 3), np.uint8), (640, 640))
@@ -276,36 +265,6 @@ def test_a_blob_does_not_hide_a_face_that_the_main_canvas_misses():
     assert boxes_of(faces, (800, 800)) == [EAR, MODEST]
 
 
-@pytest.mark.parametrize(
-    ("faces", "shape", "passes"),
-    [
-        ([MODEST], (800, 800), [128, 640]),  # the points are those of the main canvas alone
-        ([MODEST, FAR], (800, 800), [128, 640]),
-        ([TIGHT], (800, 800), [128, 640, 320]),
-        ([TIGHT], (300, 200), [128, 320]),
-        ([], (800, 800), [128, 640, 320, 640]),
-    ],
-)
-def test_passes_that_a_picture_costs(faces, shape, passes):
-    detector = Sight(*faces)
-    find_faces(detector, np.zeros((*shape, 3), np.uint8))
-    assert detector.passes == passes
-
-
-@pytest.mark.parametrize(
-    ("sizes", "enlarge", "shape"),
-    [
-        (((320, 320),), True, (900, 900)),
-        (((640, 640),), True, (900, 900)),  # a graph of a fixed size
-        (((640, 640), (320, 320)), False, (480, 300)),
-    ],
-)
-def test_no_question_where_no_face_can_be_too_large_or_no_other_canvas_is(sizes, enlarge, shape):
-    detector = Sight(MODEST, sizes=sizes, enlarge=enlarge)
-    find_faces(detector, np.zeros((*shape, 3), np.uint8))
-    assert detector.passes == [sizes[0][0]]
-
-
 class Picky:
     """Finds a face only from the ``wanted``-th look on."""
 
@@ -349,24 +308,6 @@ def test_looks_again_near_and_then_in_a_border(wanted, shape):
         assert share[1].mean() == pytest.approx(0.8 / 1.8, abs=0.03)
     # The middle of the picture, however it was looked at.
     np.testing.assert_allclose(face.keypoints[0], [shape[1] / 2, shape[0] / 2], atol=1)
-
-
-@pytest.mark.parametrize(("shape", "passes"), [((250, 250), 2), ((320, 200), 2), ((321, 200), 3)])
-def test_yunet_does_not_look_twice_at_one_canvas(shape, passes):
-    """A picture of at most 320 pixels trims to the same canvas at 640 and at 320."""
-
-    def answer(blob, outputs):
-        height, width = blob.shape[2:]
-        widths = {"cls": 1, "obj": 1, "bbox": 4, "kps": 10}
-        return [
-            np.zeros((1, (height // int(s)) * (width // int(s)), widths[role]), np.float32)
-            for role, s in (name.split("_") for name in outputs)
-        ]
-
-    session = Replay(answer)
-    assert find_faces(YuNet(session), np.zeros((*shape, 3), np.uint8)) == []
-    canvases = [blob.shape[2:] for blob in session.fed]
-    assert len(canvases) == len(set(canvases)) == passes
 
 
 def test_nothing_found_is_an_empty_list():
@@ -443,22 +384,3 @@ def test_a_bystander_is_never_taken_for_a_face_that_fills_the_photo(name, shared
     for picture, right in pictures:
         for policy in (FacePolicy.DOMINANT, FacePolicy.LARGEST):
             assert pack.embed_photo(jpeg(picture), policy=policy).embedding @ right > 0.8
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(("name", "off"), [("w600k_mbf", 0.05), ("yunet_mobilefacenet128", 0.45)])
-def test_tight_photos_give_the_descriptor_of_the_whole_photo(name, off, shared_data, lfw_photos):
-    """Cosines to the right crop: none of something else, few below 0.95, and nobody is missed.
-
-    YuNet's points move the descriptor by as much from one canvas to the next at any size.
-    """
-    pack = ModelPack.load(shared_data / "packs" / name, threads=1)
-    photos = [decode_image(p.read_bytes()) for p in sorted(lfw_photos.glob("*/*_0001.jpg"))]
-    cosines = np.array(
-        [
-            pack.embed(pack.align(picture, pack.detect(picture)[0])[None])[0] @ right
-            for picture, right in tight_photos(pack, photos, margins=(0.4, 0.3, 0.2, 0.1, 0.0))
-        ]
-    )
-    assert cosines.min() > 0.7
-    assert np.mean(cosines < 0.95) < off

@@ -1,6 +1,4 @@
 import io
-import itertools
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -74,11 +72,6 @@ def test_a_file_over_the_limit_is_not_read_whole(pack, tmp_path):
     assert [failure.code for failure in result.failures] == ["image_too_large"]
 
 
-def test_nothing_in_nothing_out(pack):
-    result = Extractor(pack).extract([])
-    assert result.descriptors.shape == (0, pack.info.n)
-
-
 def test_copies_of_one_file_are_embedded_once(pack, files, tmp_path, monkeypatch):
     copy = tmp_path / "copy.png"
     copy.write_bytes(files[0].read_bytes())
@@ -98,15 +91,6 @@ def test_the_cache_spares_the_second_run(pack, files, monkeypatch):
     second = Extractor(pack, cache=cache).extract(files[::-1])
     assert second.cached == len(files)
     np.testing.assert_array_equal(second.descriptors, first.descriptors[::-1])
-
-
-def test_the_cache_knows_the_picture_and_not_its_name(pack, files):
-    cache = EmbeddingCache()
-    Extractor(pack, cache=cache).extract([files[0]])
-    files[0].write_bytes(files[1].read_bytes())
-    result = Extractor(pack, cache=cache).extract([files[0]])
-    assert result.cached == 0
-    np.testing.assert_allclose(result.descriptors, expected([1]), atol=2e-5)
 
 
 def test_another_model_or_preprocessing_misses_the_cache(pack, files, tmp_path):
@@ -132,41 +116,12 @@ def test_the_cache_file_is_written_even_when_inference_breaks(pack, files, monke
     assert flushed == [True]
 
 
-def test_the_cache_file_is_written_now_and_then(pack, files, monkeypatch):
-    """By a clock that ticks when it is read: 15 ticks apart, or 20 times what writing takes."""
-    monkeypatch.setattr(extraction, "CHUNK", 1)
-    clock = itertools.count()
-    monkeypatch.setattr(extraction, "time", SimpleNamespace(monotonic=lambda: next(clock)))
-    cache, told, flushed = EmbeddingCache(), [], []
-    monkeypatch.setattr(cache, "flush", lambda: flushed.append(sum(told)))
-    Extractor(pack, cache=cache).extract((files * 6)[:40], progress=told.append)
-    assert flushed == [15, 35, 40]
-
-
-def test_a_function_is_told_how_many_are_done(pack, files, monkeypatch):
-    monkeypatch.setattr(extraction, "CHUNK", 3)
-    told = []
-    Extractor(pack).extract(files, progress=told.append)
-    assert told == [3, 3, 1]
-
-
 def test_repr_shows_no_numbers(pack, files):
     result = Extractor(pack).extract(files[:1])
     assert "descriptors" not in repr(result)
 
 
 # -- real models and real faces ----------------------------------------------------------------
-
-
-def test_real_photos_in_bulk_equal_single_ones(mbf_pack_dir, lfw_photos, tmp_path):
-    pack = ModelPack.load(mbf_pack_dir, threads=1, detector_size=320)
-    paths = sorted(lfw_photos.glob("*/*_0001.jpg"))[:6]
-    blank = tmp_path / "blank.png"
-    Image.new("RGB", (100, 80), (90, 90, 90)).save(blank)
-    result = Extractor(pack).extract([*paths, blank])
-    single = [pack.embed_photo(p.read_bytes(), policy=None, quality=None).embedding for p in paths]
-    np.testing.assert_allclose(result.descriptors, single, atol=1e-5)
-    assert result.failure_counts() == {"no_face": 1}
 
 
 def test_aligned_crops_skip_detection(mbf_pack_dir, lfw_aligned, monkeypatch):

@@ -94,17 +94,6 @@ def test_points_and_descriptors_are_those_of_insightface(size, mbf_pack_dir, lfw
     assert cosine > 0.9999
 
 
-@pytest.mark.long
-def test_so_are_those_of_400_photos(mbf_pack_dir, lfw_photos):
-    pack = ModelPack.load(mbf_pack_dir, threads=1)
-    reference = InsightFace(mbf_pack_dir, pack.info)
-    photos = [decode_image(path.read_bytes()) for path in sorted(lfw_photos.glob("*/*.jpg"))[::4]]
-    points, cosine, compared = worst(pack, reference, photos, 640)
-    assert compared >= 400
-    assert points < 0.01
-    assert cosine > 0.9999
-
-
 def test_the_service_takes_those_points_unless_the_face_fills_the_photo(mbf_pack_dir, lfw_photos):
     pack = ModelPack.load(mbf_pack_dir, threads=1)
     for path in sorted(lfw_photos.glob("*/*_0002.jpg"))[:6]:

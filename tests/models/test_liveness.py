@@ -14,7 +14,6 @@ from models.alignment import template
 from models.errors import ModelError, NoFace, PackError
 from models.liveness import LivenessInput, box_region, crop_face, square_region
 from models.pack import ModelPack
-from models.pack_graphs import Role, inspect
 from models.photos import embed_photos
 from tests.models.graphs import (
     fixed_face_detector,
@@ -148,15 +147,6 @@ def test_the_crop_of_a_box(box, scale):
     assert np.array_equal(crop, expected)
 
 
-def test_a_square_inside_the_frame_is_reduced_by_areas():
-    frame = picture(2, 200, 200)
-    box = (70.0, 60.0, 130.0, 140.0)
-    assert square_region(box, 1.5) == (40, 40, 160, 160)
-    crop = crop_face(frame, box, expects(crop="square", crop_scale=1.5, size=60))
-    blocks = frame[40:160, 40:160].astype(np.float64).reshape(60, 2, 60, 2, 3).mean(axis=(1, 3))
-    assert np.abs(crop - blocks).max() <= 0.5 + 1e-9
-
-
 @pytest.mark.parametrize(
     ("box", "off"),
     [
@@ -175,12 +165,6 @@ def test_a_square_over_the_border_mirrors_the_frame(box, off):
     expected = cv2.resize(cut, (64, 64), interpolation=cv2.INTER_AREA).astype(int)
     crop = crop_face(frame, box, expects(crop="square", crop_scale=1.5, size=64)).astype(int)
     assert np.abs(crop - expected).max() <= off
-
-
-def test_the_memory_of_a_square_does_not_depend_on_how_far_it_reaches():
-    thin = picture(4, 4, 4000)
-    crop = crop_face(thin, (0.0, 0.0, 4000.0, 4.0), expects(crop="square", crop_scale=8.0))
-    assert crop.shape == (80, 80, 3)
 
 
 @pytest.mark.parametrize(
@@ -258,11 +242,6 @@ def test_the_scale_in_the_name_that_the_authors_give(tmp_path, name, scale):
     assert pack_of(tmp_path, **{name: NET}).liveness.members[0].expects.crop_scale == scale
 
 
-def test_pack_toml_wins_over_the_name(tmp_path):
-    toml = stated(file=f'"{NAMED}.onnx"', crop_scale=3.0)
-    assert pack_of(tmp_path, toml, **{NAMED: NET}).liveness.members[0].expects.crop_scale == 3
-
-
 @pytest.mark.parametrize(
     ("toml", "graphs", "said"),
     [
@@ -278,20 +257,6 @@ def test_pack_toml_wins_over_the_name(tmp_path):
 def test_mistakes_are_named(tmp_path, toml, graphs, said):
     with pytest.raises(PackError, match=said):
         _ = pack_of(tmp_path, toml, **graphs).liveness
-
-
-def test_liveness_needs_the_whole_frame(tmp_path):
-    write_pack(tmp_path, emb=pooling_embedder(), **{NAMED: NET})
-    with pytest.raises(PackError, match="no detector"):
-        _ = ModelPack.load(tmp_path).liveness
-    assert ModelPack.load(tmp_path / "emb.onnx").liveness is None
-
-
-def test_a_graph_of_two_values_is_told_of_pack_toml(tmp_path):
-    write_pack(tmp_path, mask=mean_liveness(WEIGHTS[:, :2], size=112))
-    assert [(g.role, "[[liveness]]" in g.reason) for g in inspect(tmp_path)] == [
-        (Role.UNKNOWN, True)
-    ]
 
 
 def test_a_threshold_belongs_to_the_file_and_to_what_it_is_fed(tmp_path):

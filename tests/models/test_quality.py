@@ -1,8 +1,6 @@
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from models.alignment import TEMPLATE_112
 from models.decoding import decode_image
@@ -34,38 +32,6 @@ GOOD = Quality(
     border=0.5,
     aspect=1.4,
 )
-
-
-def photographed(yaw=0.0, pitch=0.0, roll=0.0, distance=900.0) -> np.ndarray:
-    """The five points of a turned head through a pinhole camera."""
-    a, b, c = np.radians([yaw, pitch, roll])
-    turn = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
-    nod = np.array([[1, 0, 0], [0, np.cos(b), np.sin(b)], [0, -np.sin(b), np.cos(b)]])
-    tilt = np.array([[np.cos(c), -np.sin(c), 0], [np.sin(c), np.cos(c), 0], [0, 0, 1]])
-    points = HEAD @ (tilt @ nod @ turn).T
-    return points[:, :2] * 500 / (distance - points[:, 2:]) + 200
-
-
-@pytest.mark.parametrize("yaw", [-50, -30, -10, 10, 30, 50])
-def test_yaw_of_a_turned_head(yaw):
-    measured, _, _ = measure_pose(photographed(yaw=yaw))
-    assert measured == pytest.approx(yaw, abs=8)
-
-
-@pytest.mark.parametrize("nod", [-30, -15, 15, 30])
-def test_pitch_follows_a_nod(nod):
-    straight = measure_pose(photographed())[1]
-    measured = measure_pose(photographed(pitch=nod))[1]
-    assert np.sign(measured - straight) == np.sign(nod)
-    assert abs(measured - straight) == pytest.approx(abs(nod), abs=12)
-
-
-@given(st.floats(-170, 170), st.floats(0.2, 5), st.floats(-40, 40))
-def test_tilt_and_size_change_roll_only(roll, factor, yaw):
-    upright = measure_pose(photographed(yaw=yaw))
-    tilted = measure_pose(photographed(yaw=yaw, roll=roll) * factor)
-    assert tilted[:2] == pytest.approx(upright[:2], abs=1e-6)
-    assert tilted[2] == pytest.approx(upright[2] + roll, abs=1e-6)
 
 
 def test_points_that_coincide_but_two_do_not_divide_by_zero():

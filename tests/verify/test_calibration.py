@@ -7,7 +7,6 @@ import pytest
 from numpy.typing import NDArray
 
 from enroll import Enroller
-from templates.contract import wire
 from templates.contract.document import Contract
 from templates.contract.nobody import Nobody
 from templates.decoys import client_source
@@ -25,12 +24,10 @@ from tests.verify.synthetic import (
     make_generator,
     make_pool,
     tenant_rotation,
-    unit,
 )
 from verify import Calibrated, CalibrationOptions, Verifier, calibrate
-from verify.calibration import _default_level, _protocol_pairs
 from verify.calibration_mode import ACCURACY_LEVEL
-from verify.comparisons import Lifter, honest_norms, point_trials, through_wire
+from verify.comparisons import Lifter, honest_norms, point_trials
 from verify.tenfold import Pair
 from verify.trials import enrolled_means, plan_trials, probe_sets
 
@@ -136,45 +133,6 @@ def test_probes_of_several_photos_are_calibrated_where_the_people_allow() -> Non
     assert [entry.probe_photos for entry in none.calibrations] == [1, 2]
 
 
-def test_decisions_of_means_have_the_error_rate_of_their_calibration() -> None:
-    options = CalibrationOptions(targets=(1e-1, 1e-2))
-    contract = replace(
-        calibrate_people(draw_people(120, photos=(5,)), options=options).contract,
-        photo_consistency=-1.0,
-        probe_consistency=-1.0,
-    )
-    people = draw_people(30, photos=(5,), seed=78)
-    verifier = Verifier(contract, make_generator(), rotation=tenant_rotation())
-    enroller = Enroller(
-        contract, make_generator(), rotation=tenant_rotation(), lift_secret=LIFT_SECRET
-    )
-    photos = people.descriptors.reshape(30, 5, -1)
-    stored = [enroller.from_embeddings(own[:3]) for own in photos]
-    means = unit(photos[:, 3:].sum(axis=1))
-    accepted = np.array(
-        [
-            [
-                verifier.decide_embedding(mean, template, level="fmr-1e-2", photos=2).accepted
-                for template in stored
-            ]
-            for mean in means
-        ]
-    )
-    assert np.diagonal(accepted).all()
-    # 870 attempts at 1e-2: 8.7 expected; 27 is six standard deviations away.
-    assert (accepted.sum() - 30) <= 27
-
-
-def test_bounded_memory_takes_a_subset_of_the_probes() -> None:
-    people = draw_people(20)
-    options = CalibrationOptions(most_cells=20 * 30, targets=(1e-1,))
-    contract = calibrate_people(people, options=options).contract
-    facts = contract.calibrations[0].calibrated_on
-    assert facts["impostor_trials"] == 30 * 19
-    total = len(people.names) * 19
-    assert facts["impostor_sample"] == f"{facts['impostor_trials']} of {total} cross-identity pairs"
-
-
 def test_levels_fall_to_the_smallest_that_the_data_resolve(calibrated: Calibrated) -> None:
     point, lifted = calibrated.contract.calibrations
     facts = point.calibrated_on
@@ -227,24 +185,6 @@ def test_thresholds_hold_for_people_that_calibration_has_not_seen(calibrated: Ca
     assert sum(genuine) >= 38
 
 
-def test_recalibration_keeps_the_contract_and_its_cohort(
-    people: People, calibrated: Calibrated
-) -> None:
-    again = calibrate(
-        people.descriptors,
-        people.names,
-        binding=calibrated.contract.binding,
-        source=make_generator(),
-        cohort_seed=calibrated.contract.cohort_seed,
-        options=CalibrationOptions(seed=1),
-    ).contract
-    assert again.contract_id == calibrated.contract.contract_id
-    assert again.cohort_seed == calibrated.contract.cohort_seed
-    assert (
-        again.calibrations[0].calibration_id != calibrated.contract.calibrations[0].calibration_id
-    )
-
-
 def test_the_cohort_is_new_every_time_and_the_rest_follows_the_seed() -> None:
     people = draw_people(60)
     options = CalibrationOptions(targets=(1e-1, 1e-2))
@@ -264,64 +204,6 @@ def test_people_of_one_photo_each_set_thresholds_and_show_no_rejections() -> Non
     assert point.calibrated_on["genuine_trials"] == 0
     # The agreement of photos is that of strangers who match once in a thousand.
     assert contract.photo_consistency == contract.probe_consistency
-
-
-def test_progress_rises_from_nothing_to_the_whole() -> None:
-    people = draw_people(30)
-    source = make_generator()
-    shares: list[float] = []
-    calibrate(
-        people.descriptors,
-        people.names,
-        binding=make_binding(source.source_id),
-        source=source,
-        options=CalibrationOptions(
-            targets=(1e-1,), probe_dims=(0, 2), lifted_probes=60, lifted_impostor_pairs=600, steps=5
-        ),
-        progress=lambda _what, share: shares.append(share),
-    )
-    assert shares == sorted(shares)
-    assert (shares[0], shares[-1]) == (0.0, 1.0)
-    assert max(np.diff(shares)) < 0.4
-
-
-def test_excluded_people_are_left_out(people: People) -> None:
-    source = make_generator()
-    result = calibrate(
-        people.descriptors,
-        people.names,
-        binding=make_binding(source.source_id),
-        source=source,
-        exclude=set(people.names[:40]),
-    )
-    facts = result.contract.calibrations[0].calibrated_on
-    gone = set(people.names[:40])
-    assert facts["excluded_photos"] == sum(name in gone for name in people.names)
-    assert facts["people"] == 150 - len(gone)
-
-
-def test_one_person_under_two_names_is_reported_and_can_be_merged(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr("verify.calibration.SUSPICIOUS_ABOVE", 0.7)
-    people = draw_people(40, photos=(3,), noise=0.3)
-    split = ["second name" if i == 0 else name for i, name in enumerate(people.names)]
-    source = make_generator()
-    options = CalibrationOptions(targets=(1e-1,))
-
-    def run(aliases: dict[str, str]) -> Calibrated:
-        return calibrate(
-            people.descriptors,
-            split,
-            binding=make_binding(source.source_id),
-            source=source,
-            options=options,
-            aliases=aliases,
-        )
-
-    found = run({}).report.suspicious
-    assert {found[0].first, found[0].second} == {"second name", people.names[0]}
-    assert not run({"second name": people.names[0]}).report.suspicious
 
 
 def test_ten_fold_adds_the_accuracy_level(people: People) -> None:
@@ -375,30 +257,6 @@ def test_ten_fold_pairs_that_do_not_suffice_are_refused() -> None:
         run(None, exclude=set(), names=alone)
 
 
-def test_pairs_of_two_names_of_one_person_are_genuine() -> None:
-    people = draw_people(30)
-    pairs = ten_pairs(people)
-    plan = plan_trials(people.names, photos_per_enrollment=3, rng=np.random.default_rng(0))
-    merged = replace(plan, person_of=plan.person_of.copy())
-    wrong = pairs[10]
-    merged.person_of[merged.person_of == plan.person_of[wrong.first]] = plan.person_of[wrong.second]
-    options = CalibrationOptions(protocol="ten-fold")
-    kept = np.arange(len(people.names))
-    rng = np.random.default_rng(0)
-    assert _protocol_pairs(options, pairs, kept, plan, rng) == tuple(pairs)
-    seen = _protocol_pairs(options, pairs, kept, merged, rng)
-    assert seen[10] == replace(wrong, same=True)
-    assert (*seen[:10], *seen[11:]) == (*pairs[:10], *pairs[11:])
-
-
-def test_the_default_level_is_one_that_all_calibrations_have(calibrated: Calibrated) -> None:
-    point, lifted = calibrated.contract.calibrations
-    shorter = replace(lifted, levels=lifted.levels[:1])
-    assert [level.name for level in shorter.levels] == ["fmr-1e-2"]
-    assert _default_level([point, lifted]) == "fmr-1e-3"
-    assert _default_level([point, shorter]) == "fmr-1e-2"
-
-
 def test_a_pool_contract_calibrates_and_its_clients_get_a_generator() -> None:
     pool = make_pool()
     generator = client_source(pool)
@@ -427,29 +285,6 @@ def test_honest_norms_widen_the_observed_range_and_stay_positive() -> None:
     assert (low, high) == pytest.approx((0.25, 0.45))
     low, high = honest_norms(np.array([0.01, 0.99]))
     assert (low, high) == pytest.approx((0.005, 1.0))
-
-
-def test_the_wire_changes_scores_by_less_than_a_thousandth() -> None:
-    source = make_generator()
-    people = draw_people(20, photos=(1,))
-    lifter = Lifter(make_binding(source.source_id).strategy, source, "0" * 64)
-    with Keystream.seeded("wire") as stream:
-        batch = lift(
-            source.project(draw_people(20, photos=(1,), seed=3).descriptors),
-            strategy=lifter.strategy,
-            m=6,
-            source=source,
-            stream=stream,
-        )
-    sent = through_wire(batch, contract_id="0" * 64)
-    for before, after in zip(batch, sent, strict=True):
-        for probe in source.project(people.descriptors[:5]):
-            change = spherical(probe, before.foot, before.basis) - spherical(
-                probe, after.foot, after.basis
-            )
-            assert abs(change) < 1e-3
-    data = wire.encode(batch[0], contract_id="0" * 64, dtype="float16")
-    np.testing.assert_array_equal(wire.decode(data).subspace.foot, sent[0].foot)
 
 
 def test_what_does_not_fit_is_refused(people: People) -> None:

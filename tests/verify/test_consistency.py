@@ -55,16 +55,6 @@ def test_strangers_set_it_where_photos_of_one_person_are_all_alike() -> None:
     assert found.refused.errors == 0
 
 
-def test_where_nobody_has_two_photos_strangers_set_the_limit() -> None:
-    found = limit(draw_people(60, photos=(1,)))
-    assert found.threshold == found.probe_threshold
-    assert found.refused.trials == 0
-
-
-def test_people_with_two_photos_do_where_nobody_has_three() -> None:
-    assert limit(draw_people(50, photos=(2,), noise=0.5)).refused.trials == 500
-
-
 @pytest.fixture
 def small_tiles(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(consistency, "TILE", 7)
@@ -85,13 +75,6 @@ def test_every_pair_of_different_people_is_compared_once(small_tiles: None) -> N
     found = impostor_cosines(people.descriptors, person_of, rng=np.random.default_rng(0))
     expected = [cosine for cosine, _, _ in brute_force(people.descriptors, person_of)]
     assert np.sort(found) == pytest.approx(np.sort(expected), abs=1e-6)
-
-
-def test_of_many_photos_a_subset_is_compared(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(consistency, "MOST_PHOTOS", 20)
-    people = draw_people(60, photos=(1,), n=16)
-    found = impostor_cosines(people.descriptors, np.arange(60), rng=np.random.default_rng(0))
-    assert found.size == 20 * 19 // 2
 
 
 def test_one_person_under_two_names_is_reported_first(small_tiles: None) -> None:

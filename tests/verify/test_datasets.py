@@ -130,13 +130,3 @@ def test_broken_pairs_are_refused_by_line(tmp_path: Path, text: str, message: st
     file.write_text(text)
     with pytest.raises(DatasetError, match=message):
         read_lfw_pairs(file, folder.paths)
-
-
-def test_the_real_lfw_protocol(lfw_aligned: Path) -> None:
-    folder = labelled_folder(lfw_aligned)
-    assert (len(folder), "pairs.txt" in folder.ignored) == (7701, True)
-    pairs = read_lfw_pairs(lfw_aligned / "pairs.txt", folder.paths)
-    assert len(pairs) == 6000
-    assert sum(pair.same for pair in pairs) == 3000
-    for pair in pairs:
-        assert (folder.identities[pair.first] == folder.identities[pair.second]) == pair.same

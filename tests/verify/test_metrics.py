@@ -19,15 +19,6 @@ def test_wilson_without_trials_knows_nothing() -> None:
     assert metrics.wilson(0, 0) == (0.0, 1.0)
 
 
-@given(scores, st.floats(-2, 2))
-def test_the_fnmr_counts_what_lies_below_the_threshold(
-    values: list[float], threshold: float
-) -> None:
-    fnmr = metrics.false_non_match_rate(values, threshold)
-    assert fnmr.errors == sum(value < threshold for value in values)
-    assert fnmr.trials == len(values)
-
-
 @given(scores, st.floats(0, 1))
 def test_threshold_is_the_laxest_that_holds_the_target(values: list[float], target: float) -> None:
     threshold = metrics.threshold_at_fmr(values, target)

@@ -54,20 +54,6 @@ def test_a_generator_of_others_is_not(count: int) -> None:
         assert refused(source, people) is None, (calibrated, power)
 
 
-def test_an_adapted_generator_is_not_refused_for_others_of_the_kind() -> None:
-    sample, many = drawn(60, photos=2, seed=7), drawn(600, photos=1, seed=8, power=0.3)
-    source = DecoyGenerator.adapt(many.descriptors, sample.descriptors, sample.names)
-    for calibrated in (20, 80, 300):
-        assert refused(source, drawn(calibrated, seed=2)) is None
-
-
-def test_a_part_of_the_people_of_the_fit_is_refused_where_faces_are_few() -> None:
-    people = drawn(100)
-    source = DecoyGenerator.fit(people.descriptors)
-    first = np.array(people.names) < people.names[4 * 30]
-    assert refused(source, part(people, first)) is not None
-
-
 def test_people_of_the_fit_do_not_correlate_along_its_axes() -> None:
     """The axes are the eigenvectors of their covariance; by chance the measure is 1."""
     people, others = drawn(200), drawn(200, photos=1, seed=3)

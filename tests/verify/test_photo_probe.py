@@ -10,9 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 import models.pack
-from models.boxes import Face
 from models.decoding import decode_image
-from models.detectors import Scrfd
 from models.errors import PhotoRejected
 from models.pack import ModelPack
 from templates.contract.document import Contract, LivenessCalibration
@@ -66,11 +64,6 @@ def test_a_photo_given_twice_counts_once(pack: ModelPack, contract: Contract) ->
     assert probe_of_photos(pack, contract, photos, passive=False).photos == 2
 
 
-def test_no_more_are_averaged_than_a_probe_has(pack: ModelPack, contract: Contract) -> None:
-    frames = frames_of([*performed(ASKED), "front", "front"])
-    assert probe_of_frames(pack, contract, frames, ASKED, passive=False).photos == 5
-
-
 def test_a_frame_that_is_not_good_enough_is_not_compared(
     pack: ModelPack, contract: Contract
 ) -> None:
@@ -96,40 +89,6 @@ def test_points_that_move_over_a_face_that_does_not_turn_show_no_movement(
     ]
     failure = probe_of_frames(pack, contract, frames, ASKED, passive=False).failure
     assert failure == ("missing_movement" if len(covered) == 1 else "no_turn")
-
-
-def unsure(monkeypatch: pytest.MonkeyPatch, places: set[int]) -> None:
-    """Let the detector find the faces of some pictures, but not as surely as it recommends."""
-    detect, seen = ModelPack.detect, iter(range(100))
-
-    def detect_unsurely(pack: ModelPack, image: NDArray[np.uint8]) -> list[Face]:
-        faces = detect(pack, image)
-        if next(seen) not in places:
-            return faces
-        return [replace(face, score=Scrfd.recommended_score - 0.01) for face in faces]
-
-    monkeypatch.setattr(ModelPack, "detect", detect_unsurely)
-
-
-def test_frames_that_are_compared_pass_the_gate_of_photos_with_its_score(
-    pack: ModelPack, contract: Contract, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    names = performed(ASKED)
-    frames = frames_of(names)
-    unsure(monkeypatch, {0})
-    with pytest.raises(PhotoRejected, match="not good enough"):
-        probe_of_photos(pack, contract, frames[:1], passive=False)
-    monkeypatch.undo()
-    unsure(monkeypatch, {0})
-    with pytest.raises(PhotoRejected, match=r"photo 1 of 7: .*not good enough"):
-        probe_of_frames(pack, contract, frames, ASKED, passive=False)
-    monkeypatch.undo()
-    # A frame that turns may be seen less surely; one that looks ahead is then not compared.
-    turned, ahead = names.index("turn_right"), 2
-    assert names[ahead] == "front"
-    unsure(monkeypatch, {turned, ahead})
-    probe = probe_of_frames(pack, contract, frames, ASKED, passive=False)
-    assert (probe.photos, probe.failure) == (4, None)
 
 
 def test_no_frame_keeps_its_picture(

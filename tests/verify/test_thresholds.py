@@ -79,22 +79,6 @@ def test_a_threshold_that_one_person_decides_does_not_hold_when_set_anew() -> No
     assert bound(np.where((pairs == 0).any(axis=1), scores + 9, scores)) > 0.04
 
 
-def test_a_level_counts_both_errors_and_by_photos() -> None:
-    impostors = impostors_of(np.array([3.0, 1.0, 3.0, -np.inf, 2.0]))
-    genuine = Genuine(
-        np.array([4.0, 1.0, 4.0, 1.9], dtype=np.float32),
-        np.array([0, 1, 2, 3]),
-        np.array([1, 1, 3, 3]),
-        refused=np.zeros(4, np.bool_),
-    )
-    level = make_level("fmr-1e-2", 1e-2, 2.0, impostors, genuine, seed=0)
-    assert (level.fmr.errors, level.fmr.trials) == (3, 4)
-    assert (level.fnmr.errors, level.fnmr.trials) == (2, 4)
-    counts = {k: (rate.errors, rate.trials) for k, rate in level.fnmr_by_photos.items()}
-    assert counts == {1: (1, 2), 3: (1, 2)}
-    assert level.frr_by_photos == {}
-
-
 def test_probes_that_are_refused_count_for_the_frr_only() -> None:
     impostors = impostors_of(np.array([3.0, 1.0, 3.0, -np.inf, 2.0]))
     genuine = Genuine(

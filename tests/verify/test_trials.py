@@ -3,7 +3,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.verify.synthetic import draw_people
-from verify.trials import chosen_photos, enrolled_means, impostor_groups, plan_trials, probe_sets
+from verify.trials import chosen_photos, impostor_groups, plan_trials, probe_sets
 
 names = st.lists(st.sampled_from(["a", "b", "c", "d"]), min_size=1, max_size=30)
 
@@ -36,15 +36,6 @@ def test_of_many_people_those_with_several_photos_are_compared() -> None:
         names, photos_per_enrollment=2, rng=np.random.default_rng(0), most_templates=1
     )
     assert set(fewer.person_of[fewer.genuine]) == set(fewer.compared.tolist()) < {1, 3}
-
-
-def test_means_are_unit_and_of_the_enrolled_photos() -> None:
-    people = draw_people(9)
-    plan = plan_trials(people.names, photos_per_enrollment=3, rng=np.random.default_rng(0))
-    means = enrolled_means(people.descriptors, plan)
-    for mean, photos in zip(means, plan.enrolled, strict=True):
-        total = people.descriptors[photos].astype(float).sum(axis=0)
-        np.testing.assert_allclose(mean, total / np.linalg.norm(total), atol=1e-6)
 
 
 def test_impostor_groups_cover_all_probes_with_distinct_people() -> None:

@@ -17,7 +17,7 @@ from templates.decoys import DecoyGenerator, DecoyPool, DecoySource
 from templates.distances import pairwise_distances, similarity
 from templates.keys.randomness import Keystream
 from templates.space.lifting import Strategy, lift
-from verify.metrics import false_non_match_rate, threshold_at_fmr
+from verify.metrics import threshold_at_fmr
 
 pytestmark = pytest.mark.long
 
@@ -66,7 +66,7 @@ def fnmr(source: DecoySource, subjects: Rows, *, m: int, seeds: int) -> float:
         templates = lift(points, strategy=Strategy.ADVERSARIAL, m=m, source=source, stream=stream)
         scores = similarity(pairwise_distances(points, templates, metric="spherical"))
         threshold = threshold_at_fmr(scores[~same], 1e-3)
-        rates.append(false_non_match_rate(scores[genuine], threshold).value)
+        rates.append(float(np.mean(scores[genuine] < threshold)))
     return 100 * float(np.mean(rates))
 
 

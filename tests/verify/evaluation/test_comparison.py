@@ -103,14 +103,6 @@ def test_a_device_gives_the_similarities_of_the_processor() -> None:
         compared(known, device="nowhere")
 
 
-def test_seeds_change_lifts_and_one_seed_repeats_them() -> None:
-    known = made_trials(pairs=20)
-    one, again, other = (compared(known, seed=seed) for seed in (1, 1, 2))
-    for name, similarities in one.items():
-        np.testing.assert_array_equal(similarities, again[name])
-        assert (similarities != other[name]).any()
-
-
 def test_halves_are_disjoint_and_cover_the_pool() -> None:
     whole = pool(121)
     one, two = split_pool(whole, seed=7)
@@ -132,21 +124,6 @@ def test_shared_decoys_make_strangers_meet_and_halves_do_not() -> None:
     met = similarity(1e-3)
     assert np.mean(shared[~few.same] > met) > 0.7
     assert not (apart[~few.same] > met).any()
-
-
-@pytest.mark.parametrize(
-    ("strategy", "kind", "shared"),
-    [("random", None, None), ("adversarial", "generator", None), ("adversarial", "pool", True)],
-)
-def test_runs_name_their_decoys(strategy: str, kind: str | None, shared: bool | None) -> None:
-    known = made_trials(pairs=20)
-    if kind == "generator":
-        made = DecoyGenerator.fit(made_trials(people=200).embeddings)
-        known = dataclasses.replace(known, sources=(made,))
-    plan = EvaluationPlan((strategy,), shared_decoys=True)
-    runs = compare(known, Unit(strategy, 4, None if kind is None else 0, 0), plan)
-    assert len(runs) == 6
-    assert {(names["decoys"], names["shared_decoys"]) for names, _ in runs} == {(kind, shared)}
 
 
 def test_hybrid_plus_takes_the_attributes_of_each_photo(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,8 +16,6 @@ from verify.evaluation.embedding import (
     FileEmbedder,
     PackEmbedder,
     are_aligned,
-    digest_of_pictures,
-    digests,
 )
 from verify.evaluation.embeddings_file import EmbeddingsFile
 from verify.evaluation.verification_set import VerificationSet, contiguous_folds
@@ -107,51 +105,6 @@ def test_every_picture_has_a_row_or_a_reason(mixed: VerificationSet, pack: Model
     assert [failure.code for failure in found.failures[2:]] == ["unreadable_file"] * 2
     # Equal pictures are worked on once, and those that cannot be read not at all.
     assert seen == [4, 4]
-
-
-def test_equal_pictures_are_embedded_once(pack: ModelPack, monkeypatch: pytest.MonkeyPatch) -> None:
-    given: list[int] = []
-    plain = ModelPack.embed
-
-    def counted(self: ModelPack, crops: np.ndarray) -> np.ndarray:
-        given.append(len(crops))
-        return plain(self, crops)
-
-    monkeypatch.setattr(ModelPack, "embed", counted)
-    # Copies far apart, so that they would be in different chunks.
-    monkeypatch.setattr("models.extraction.CHUNK", 2)
-    pairs = verification_set([Photo(f"{i}", FACES[i % 3]) for i in range(12)])
-    found = acquired(pairs, pack)
-    assert sum(given) == 3
-    np.testing.assert_array_equal(found.rows, np.arange(12) % 3)
-
-
-def test_a_cache_serves_the_second_call(
-    mixed: VerificationSet, pack: ModelPack, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    cache = EmbeddingCache()
-    first = acquired(mixed, pack, cache=cache)
-    assert len(cache) == 3
-
-    def refused(self: ModelPack, crops: np.ndarray) -> np.ndarray:
-        raise AssertionError("embedded again")
-
-    monkeypatch.setattr(ModelPack, "embed", refused)
-    second = acquired(mixed, pack, cache=cache)
-    np.testing.assert_array_equal(first.embeddings, second.embeddings)
-    np.testing.assert_array_equal(first.rows, second.rows)
-    assert first.failures == second.failures
-    with pytest.raises(AssertionError, match="embedded again"):
-        acquired(mixed, pack)
-
-
-def test_digests_tell_contents_apart(mixed: VerificationSet) -> None:
-    found = digests(mixed)
-    assert found[0] == found[2] != found[3]
-    assert found[7] == found[8] == ""
-    assert len(digest_of_pictures(found)) == 64
-    assert digest_of_pictures(found) == digest_of_pictures(list(found))
-    assert digest_of_pictures(found) != digest_of_pictures(found[::-1])
 
 
 def test_photos_that_a_file_of_embeddings_lacks_failed_to_acquire() -> None:

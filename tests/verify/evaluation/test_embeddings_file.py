@@ -12,10 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from models.extraction import Photo
-from tests.verify.evaluation.layouts import cfp_folder, lfw_folder, write
+from tests.verify.evaluation.layouts import write
 from verify import DatasetError
 from verify.evaluation.embeddings_file import EmbeddingsFile, match, read_embeddings
-from verify.evaluation.readers import open_sets
 from verify.evaluation.verification_set import VerificationSet
 
 pytestmark = pytest.mark.usefixtures("in_this_process")
@@ -108,14 +107,6 @@ def npy(header: str) -> bytes:
     return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text
 
 
-def test_rows_beyond_float32_become_unit(tmp_path: Path) -> None:
-    for order in ("C", "F"):
-        rows = np.asarray(np.array([[3e100, 4e100], [3e-100, 4e-100]]), order=order)
-        np.savez(tmp_path / "e.npz", paths=PATHS[:2], descriptors=rows)
-        read = read_embeddings(tmp_path / "e.npz")
-        np.testing.assert_allclose(read.descriptors, [[0.6, 0.8], [0.6, 0.8]], atol=1e-7)
-
-
 def test_a_cut_archive(tmp_path: Path) -> None:
     np.savez(tmp_path / "e.npz", paths=PATHS, descriptors=ROWS)
     data = (tmp_path / "e.npz").read_bytes()
@@ -205,20 +196,3 @@ def test_a_photo_of_another_person_is_never_taken() -> None:
     np.testing.assert_array_equal(
         match(embeddings(["/x/bob/1.jpg", "/x/eve/1.jpg"]), mine), [-1, 0]
     )
-
-
-def test_photos_of_a_bin_by_place() -> None:
-    bins = benchmark("bin", ["00000", "00001", "00007"])
-    paths = [f"{place:05d}" for place in range(8)]
-    positions = match(embeddings(paths), bins)
-    np.testing.assert_array_equal(positions, [0, 1, 7])
-    assert positions.dtype == np.int64
-
-
-def test_sets_without_photos(tmp_path: Path) -> None:
-    lfw_folder(tmp_path / "lfw", photos=False)
-    cfp_folder(tmp_path / "cfp", photos=False)
-    for root in ("lfw", "cfp"):
-        for one in open_sets(tmp_path / root, pictures=False):
-            paths = [f"/elsewhere/{picture.name}" for picture in one.pictures]
-            np.testing.assert_array_equal(match(embeddings(paths), one), np.arange(len(paths)))

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.verify.evaluation.layouts import bin_content, drawn
-from verify import DatasetError, labelled_folder, read_lfw_pairs
+from verify import DatasetError
 from verify.evaluation.readers import notes, open_sets
 from verify.evaluation.verification_set import VerificationSet
 from verify.tenfold import FOLDS
@@ -87,10 +87,6 @@ def test_answers(tmp_path: Path, answers: object) -> None:
     np.testing.assert_array_equal(benchmark.same, np.arange(2 * FOLDS) % 2 == 0)
 
 
-def test_a_pickle_is_recognised_without_its_suffix(tmp_path: Path) -> None:
-    assert read(tmp_path / "agedb_30.pkl", bin_content()).name == "agedb_30"
-
-
 BINS, SAME = bin_content()
 
 
@@ -160,22 +156,6 @@ def test_random_files_only_ever_raise_dataset_errors(
     file.write_bytes(data)
     with pytest.raises(DatasetError):
         open_sets(file)
-
-
-def test_real_crops_give_the_pairs_of_the_folder(lfw_aligned: Path, tmp_path: Path) -> None:
-    """Cut LFW down to one genuine and one impostor pair a fold, as a ``.bin``."""
-    folder = labelled_folder(lfw_aligned)
-    pairs = read_lfw_pairs(lfw_aligned / "pairs.txt", folder.paths)
-    chosen = [pairs[600 * fold + place] for fold in range(FOLDS) for place in (0, 300)]
-    bins = [folder.paths[p].read_bytes() for one in chosen for p in (one.first, one.second)]
-    benchmark = read(tmp_path / "lfw.bin", (bins, [one.same for one in chosen]))
-    assert len(benchmark.pictures) == len(set(bins))
-    for pair, one in enumerate(chosen):
-        photo = benchmark.pictures[benchmark.first[pair]].read()
-        assert photo == folder.paths[one.first].read_bytes()
-        assert benchmark.same[pair] == one.same
-        assert benchmark.folds[pair] == one.fold
-    assert notes(benchmark) == ["lfw has 20 pairs, the published set has 6,000"]
 
 
 def test_notes_of_unusual_sets(tmp_path: Path) -> None:

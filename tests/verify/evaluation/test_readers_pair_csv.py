@@ -161,16 +161,3 @@ def test_a_name_that_means_something_elsewhere_is_refused(tmp_path: Path, name: 
     with pytest.raises(DatasetError, match="rename the file") as caught:
         open_sets(file, pictures=False)
     assert str(caught.value).isprintable()
-
-
-def test_other_names_are_kept(tmp_path: Path) -> None:
-    for name in ("Gesichter für (alle) #1, neu=alt", "x" * 100):
-        file = write(tmp_path / f"{name}.csv", table(HEADER, "a,b,1", "a,c,0"))
-        (one,) = open_sets(file, pictures=False)
-        assert one.name == name
-
-
-def test_a_suffix_that_is_not_printable_is_refused(tmp_path: Path) -> None:
-    file = write(tmp_path / "mine.\udcff", table(HEADER, "a,b,1", "a,c,0"))
-    with pytest.raises(DatasetError, match="rename the file"):
-        open_sets(file, pictures=False)

@@ -34,21 +34,6 @@ def test_every_number_of_the_table_is_in_the_results() -> None:
     assert "mean of 3 seeds" in block
 
 
-def test_a_cell_that_was_not_run_is_a_dash() -> None:
-    results = sample_results(dims=(2, 16), liftings=(("random", None),))
-    results["rows"] = [r for r in results["rows"] if (r["mode"], r["dim"]) != ("s2s", 16)]
-    assert table_rows([results])[-1]["m = 16"] == "-"
-
-
-def test_a_single_seed_has_no_spread() -> None:
-    results = sample_results(dims=(2,))
-    for row in results["rows"]:
-        row["accuracy_std_seeds"] = None
-    block = readme_table([results])
-    assert "one seed" in block
-    assert "±" not in block.split("Raw embeddings")[1].split("\n", 1)[1]
-
-
 def test_several_results_make_one_table_between_the_markers_only(tmp_path: Path) -> None:
     results = sample_results(dims=(2, 16), datasets=("lfw", "cfp_fp"))
     files = []

@@ -20,15 +20,13 @@ from verify.evaluation.experiment import (
     ROW,
     SetResult,
     averaged,
-    group_rates,
     run_trials,
     trials_of,
 )
-from verify.evaluation.intervals import fmr_grid, replicate_weights
-from verify.evaluation.labels_file import Labels
+from verify.evaluation.intervals import replicate_weights
 from verify.evaluation.plan import EvaluationPlan, Mode
 from verify.evaluation.provenance import Model
-from verify.evaluation.results import collision_floor, curve_of, document, row_of
+from verify.evaluation.results import collision_floor, document, row_of
 from verify.evaluation.verification_set import VerificationSet
 from verify.metrics import threshold_at_fmr, wilson
 
@@ -204,22 +202,6 @@ def test_the_collision_floor(strategy: str, dim: int, entries: int, expected: fl
     assert collision_floor(names | {"shared_decoys": False}, source) == 0
 
 
-def test_groups_are_counted_at_the_threshold_of_each_run() -> None:
-    plan = EvaluationPlan(("raw",), targets=(0.1,))
-    trials, runs = made_trials(), run(plan)
-    people = {f"{i}": {"side": "even" if i % 4 < 2 else "odd"} for i in range(60)}
-    groups, summaries = group_rates(
-        runs, [SetResult(faces(np.arange(60)), trials, (), None)], Labels(("side",), people), plan
-    )
-    threshold = runs["fnmr_at_fmr"].iloc[0]["0.1"]["threshold"]
-    cosines = (trials.embeddings[trials.first] * trials.embeddings[trials.second]).sum(axis=1)
-    even = (trials.first % 4 < 2) & (trials.second % 4 < 2)
-    (found,) = (group for group in groups if group["group"] == "even")
-    assert found["fmr"]["trials"] == np.count_nonzero(even & ~trials.same)
-    assert found["fmr"]["errors"] == np.count_nonzero((cosines >= threshold) & even & ~trials.same)
-    assert summaries[0]["threshold"] == threshold
-
-
 def written_out(known: Trials, runs: pd.DataFrame, fmr: float) -> tuple[float, float]:
     """95 % interval of the mean FNMR: trials repeated as often as they were drawn, run by run."""
     every = []
@@ -249,20 +231,3 @@ def test_intervals_are_those_of_replicates_written_out(named: bool) -> None:
     assert at["ci_low"] == pytest.approx(low, abs=0.05)
     assert at["ci_high"] == pytest.approx(high, abs=0.05)
     assert at["interval"] == ("subject-bootstrap" if named else "pair-bootstrap")
-
-
-def test_the_band_of_a_curve_is_that_of_replicates_written_out() -> None:
-    known = made_trials(people=40, pairs=400)
-    runs = run(SPREAD, known)
-    curve = curve_of(runs, known)
-    grid = fmr_grid(200)
-    np.testing.assert_allclose(curve["fmr"], grid)
-    for place in (10, 25, 40):
-        low, high = written_out(known, runs, grid[place])
-        assert curve["low"][place] == pytest.approx(low, abs=0.05)
-        assert curve["high"][place] == pytest.approx(high, abs=0.05)
-    # One run has the spread of people only.
-    alone = curve_of(runs[:1], known)
-    low, high = np.percentile(runs["replicates"].iloc[0][:, 1:], [2.5, 97.5], axis=0)
-    np.testing.assert_allclose(alone["low"], low, atol=1e-6)
-    np.testing.assert_allclose(alone["high"], high, atol=1e-6)
