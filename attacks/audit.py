@@ -26,7 +26,7 @@ from templates.keys.randomness import KEY_BYTES, Keystream
 from templates.keys.rotation import ROTATION_VERSION
 from templates.space.lifting import Strategy
 from verify import CalibrationOptions, calibrate
-from verify.evaluation.attributes import resembling
+from verify.evaluation.attributes import resembling_rows
 from verify.own_decoys import require_others
 
 DEFAULT_SHARE = 0.83
@@ -242,7 +242,7 @@ def _known(
 def _require_strangers(pool: DecoyPool, population: Population) -> None:
     """Refuse a pool that holds photos of the victims: every attack would find them in it."""
     shown = np.concatenate([population.victims.enrolled, population.victims.fresh])
-    if len(resembling(pool, shown, cosine=SAME_PHOTO)):
+    if len(resembling_rows(pool.entries[0], shown, cosine=SAME_PHOTO)):
         raise AuditError(
             "the decoy pool holds photos of PEOPLE, and an attack would find the victims in it: "
             "give people who are not in the pool"

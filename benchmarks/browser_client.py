@@ -114,14 +114,14 @@ def page_of(url: str, key: str, *, level: str) -> Iterator[Application]:
     """Serve the page, whose tokens are of this key and this level."""
     with Client(url, key) as client:
 
-        def authorize(asked: Mapping[str, str]) -> dict[str, str]:
-            verifies = asked["action"] == "verify"
+        def authorize(wish: Mapping[str, str]) -> dict[str, str]:
+            verifies = wish["action"] == "verify"
             issued = client.create_token(
-                asked["subject"],
+                wish["subject"],
                 "verify" if verifies else "enroll",
                 level=level if verifies else None,
             )
-            return {"subject": asked["subject"], "token": issued.token}
+            return {"subject": wish["subject"], "token": issued.token}
 
         with application(url, authorize) as served:
             served.program = for_browsers(PROGRAM.read_text(encoding="utf-8"))
@@ -276,9 +276,9 @@ def faces_of(
         vectors[f"descriptor {name}"] = pack.embed(crop[None])[0]
     for person in people:
         names = [f"descriptor {photo.name}" for photo in person.enroll]
-        found = [vectors[name] for name in names if name in vectors]
-        if found:
-            mean = np.mean(found, axis=0)
+        rows = [vectors[name] for name in names if name in vectors]
+        if rows:
+            mean = np.mean(rows, axis=0)
             vectors[f"mean of {person.name}"] = mean
             vectors[f"unit mean of {person.name}"] = mean / np.linalg.norm(mean)
     return LeakSearch(vectors=vectors, strings=strings)

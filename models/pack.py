@@ -365,22 +365,23 @@ class ModelPack:
 def _embedder(graph: PackGraph, stated: PackFile, flip: bool) -> Embedder:
     size = image_size(graph.session.inputs)
     fixed = None if size is None else size[0]
-    told = stated.embedder
-    if fixed is not None and told.input_size not in (None, fixed):
+    if fixed is not None and stated.embedder.input_size not in (None, fixed):
         raise PackError(
-            f"pack.toml states input_size {told.input_size}, and {graph.path} takes {fixed} only;"
-            " remove the key."
+            f"pack.toml states input_size {stated.embedder.input_size}, and {graph.path} takes"
+            f" {fixed} only; remove the key."
         )
-    side = int(fixed or told.input_size or 0)
+    side = int(fixed or stated.embedder.input_size or 0)
     try:
-        is_inside = None in (told.mean, told.scale) and normalises_inside(graph.session, side)
+        is_inside = None in (stated.embedder.mean, stated.embedder.scale) and normalises_inside(
+            graph.session, side
+        )
         mean, scale = (0.0, 1.0) if is_inside else (127.5, 127.5)
         preprocessing = Preprocessing(
             alignment=TEMPLATE_NAME,
             size=side,
-            channel_order=told.channel_order or "rgb",
-            mean=told.mean or (mean,) * 3,
-            scale=told.scale or (scale,) * 3,
+            channel_order=stated.embedder.channel_order or "rgb",
+            mean=stated.embedder.mean or (mean,) * 3,
+            scale=stated.embedder.scale or (scale,) * 3,
             flip=flip,
         )
         return Embedder(graph.session, preprocessing)

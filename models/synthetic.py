@@ -21,7 +21,6 @@ Colour = tuple[int, int, int]
 _SHIFT = 4  # OpenCV draws at 1/16 pixel, so that small differences of shape are seen
 _CANVAS = 224  # drawn at twice the template's size, then reduced by area
 _SKIN = ((255, 224, 196), (84, 54, 40))
-_HAIR = ((24, 20, 20), (205, 165, 100))
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """From labelled descriptors to a contract: thresholds for stated false match rates."""
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from templates.contract.canonical import Json
 from templates.contract.document import Binding, Calibration, Contract
 from templates.contract.nobody import Nobody
-from templates.decoys import Attributes, DecoySource, client_source
+from templates.decoys import DecoySource, client_source
 from templates.errors import ContractError
 from templates.keys.randomness import KEY_BYTES, Keystream
 from templates.space.embedding import unit_descriptors
@@ -84,10 +84,6 @@ def part_of(progress: Progress, first: float, last: float) -> Progress:
     return lambda what, share: progress(what, first + (last - first) * share)
 
 
-def _silent(_what: str, _share: float) -> None:
-    """Show no progress."""
-
-
 def calibrate(
     descriptors: NDArray[np.floating],
     identities: Sequence[str],
@@ -97,13 +93,12 @@ def calibrate(
     options: CalibrationOptions | None = None,
     exclude: Collection[str] = (),
     aliases: Mapping[str, str] | None = None,
-    attributes: Sequence[Attributes] | None = None,
     labels: PhotoLabels | None = None,
     pairs: Sequence[Pair] | None = None,
     cohort_seed: bytes | None = None,
     recorded: Mapping[str, Json] | None = None,
     dataset: str = "labelled folder",
-    progress: Callable[[str, float], None] = _silent,
+    progress: Progress = lambda _what, _share: None,
 ) -> Calibrated:
     """Calibrate a contract on the private templates of labelled people.
 
@@ -119,8 +114,6 @@ def calibrate(
         Unit rows.
     aliases
         Second names of one person, mapped to the first.
-    attributes
-        One per descriptor, for hybrid+; without them hybrid+ is calibrated on decoys of any label.
     labels
         Of every descriptor, for rates by group of people; none without them.
     pairs
@@ -177,8 +170,6 @@ def calibrate(
             enrolled_means(data, plan)[plan.compared],
             m=binding.m,
             stream=stream,
-            attributes=attributes
-            and [attributes[kept[plan.enrolled[person][0]]] for person in plan.compared],
         )
     if cohort_seed is None:
         with Keystream.fresh() as stream:

@@ -4,7 +4,7 @@ Templates pass through the wire format on the way, so that calibration sees the 
 numbers as the service. They are not rotated: a rotation leaves every distance as it was.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,25 +50,18 @@ class Lifter:
     source: DecoySource
     contract_id: str
 
-    def lift(
-        self,
-        descriptors: NDArray[np.float32],
-        *,
-        m: int,
-        stream: Keystream,
-        attributes: Sequence[Attributes] | None = None,
-    ) -> SubspaceBatch:
-        """Project embeddings, lift, encode, decode; hybrid+ without attributes takes any decoys."""
-        named = None
+    def lift(self, descriptors: NDArray[np.float32], *, m: int, stream: Keystream) -> SubspaceBatch:
+        """Project embeddings, lift, encode, decode; hybrid+ takes decoys of any label."""
+        anybody = None
         if self.strategy is Strategy.HYBRID_PLUS:
-            named = attributes or [Attributes()] * len(descriptors)
+            anybody = [Attributes()] * len(descriptors)
         lifted = lift(
             self.source.project(descriptors),
             strategy=self.strategy,
             m=m,
             source=self.source,
             stream=stream,
-            attributes=named,
+            attributes=anybody,
         )
         return through_wire(lifted, contract_id=self.contract_id)
 

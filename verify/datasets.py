@@ -1,5 +1,6 @@
-"""Readers of labelled face folders: ``root/Person/photo.jpg``, as LFW is laid out."""
+"""Labelled face folders, ``root/Person/photo.jpg`` as LFW is laid out, and tables as CSV."""
 
+import csv
 import hashlib
 from collections import Counter
 from collections.abc import Collection, Sequence
@@ -128,14 +129,19 @@ def distinct_files(files: Sequence[Path]) -> list[Path]:
 
 
 @dataclass(frozen=True)
-class NamedPair:
-    """One line of LFW's ``pairs.txt``: person and file stem of both photos."""
+class Trial:
+    """One comparison of a protocol; photos by a key that is unique in the set.
 
-    first: tuple[str, str]
-    second: tuple[str, str]
+    Parameters
+    ----------
+    fold
+        0 … 9; None where the protocol has none.
+    """
+
+    first: str
+    second: str
     same: bool
-    fold: int
-    line: int
+    fold: int | None = None
 
 
 def read_lfw_pairs(
@@ -158,26 +164,26 @@ def read_lfw_pairs(
     """
     path = Path(file)
     text = decoded(read_whole(path, most=MAX_PAIRS_BYTES), file=path)
-    index = {(entry.parent.name, entry.stem): number for number, entry in enumerate(paths)}
-    gone = {(entry.parent.name, entry.stem) for entry in missing}
+    index = {f"{entry.parent.name}/{entry.stem}": number for number, entry in enumerate(paths)}
+    gone = {f"{entry.parent.name}/{entry.stem}" for entry in missing}
     pairs: list[Pair] = []
     faults: list[str] = []
-    for named in parse_lfw_pairs(path, text):
-        keys = (named.first, named.second)
-        if any(key in gone for key in keys):
-            continue
-        if all(key in index for key in keys):
-            pairs.append(Pair(index[keys[0]], index[keys[1]], named.same, named.fold))
-        else:
-            absent = next(key for key in keys if key not in index)
-            faults.append(f"line {named.line} names {absent[0]}/{absent[1]}, which is not there")
+    for number, one in enumerate(parse_lfw_pairs(path, text)):
+        keys = (one.first, one.second)
+        absent = [key for key in keys if key not in index and key not in gone]
+        if absent:
+            faults.append(f"line {number + 2} names {absent[0]}, which is not there")
+        elif not gone & {*keys}:
+            pairs.append(Pair(index[one.first], index[one.second], one.same, one.fold or 0))
     if faults:
         raise DatasetError(faults_in(path, "expected LFW's pairs format", faults))
     return pairs
 
 
-def parse_lfw_pairs(path: Path, text: str) -> list[NamedPair]:
-    """Parse the text of LFW's ``pairs.txt``; ``path`` is for messages only.
+def parse_lfw_pairs(path: Path, text: str) -> list[Trial]:
+    """Parse the text of LFW's ``pairs.txt``: keys are ``Name/Name_0001``.
+
+    ``path`` is for messages only.
 
     The header is ``folds<TAB>pairs per class and fold``; every fold then has that many lines
     ``Name i j`` of one person and as many lines ``NameA i NameB j`` of two.
@@ -194,7 +200,7 @@ def parse_lfw_pairs(path: Path, text: str) -> list[NamedPair]:
         lines.pop()
     if len(lines) - 1 != promised:
         raise DatasetError(f"{path.name} promises {promised} pairs and holds {len(lines) - 1}")
-    pairs: list[NamedPair] = []
+    trials: list[Trial] = []
     faults: list[str] = []
     for number, line in enumerate(lines[1:]):
         fold, place = divmod(number, 2 * per_class)
@@ -204,10 +210,10 @@ def parse_lfw_pairs(path: Path, text: str) -> list[NamedPair]:
             form = "Name i j" if same else "NameA i NameB j"
             faults.append(f"line {number + 2} is not of the form {form}")
         else:
-            pairs.append(NamedPair(*keys, same=same, fold=fold, line=number + 2))
+            trials.append(Trial(*keys, same, fold))
     if faults:
         raise DatasetError(faults_in(path, "expected LFW's pairs format", faults))
-    return pairs
+    return trials
 
 
 def _header(path: Path, lines: Sequence[str]) -> tuple[int, int]:
@@ -220,8 +226,8 @@ def _header(path: Path, lines: Sequence[str]) -> tuple[int, int]:
     return folds, per_class
 
 
-def _photo_keys(line: str, *, same: bool) -> tuple[tuple[str, str], tuple[str, str]] | None:
-    """Person and file stem of both photos, or None where the line has another form."""
+def _photo_keys(line: str, *, same: bool) -> tuple[str, str] | None:
+    """Keys of both photos, or None where the line has another form."""
     parts = line.split("\t") if "\t" in line else line.split()
     if len(parts) != (3 if same else 4):
         return None
@@ -229,7 +235,7 @@ def _photo_keys(line: str, *, same: bool) -> tuple[tuple[str, str], tuple[str, s
     second, j = (first, rest[0]) if same else (rest[0], rest[1])
     if not all(number.isdecimal() and len(number) < 7 for number in (i, j)):
         return None
-    return (first, f"{first}_{int(i):04d}"), (second, f"{second}_{int(j):04d}")
+    return f"{first}/{first}_{int(i):04d}", f"{second}/{second}_{int(j):04d}"
 
 
 def read_whole(file: Path, *, most: int) -> bytes:
@@ -266,6 +272,67 @@ def decoded(data: bytes, *, file: Path) -> str:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError:
         raise DatasetError(f"{file} is not UTF-8 text; save it as UTF-8") from None
+
+
+def csv_rows(
+    file: Path,
+    text: str,
+    *,
+    required: Collection[str],
+    optional: Collection[str] | None = None,
+) -> list[tuple[str, dict[str, str]]]:
+    """Read a table whose columns go by their names, in any case and order.
+
+    Parameters
+    ----------
+    file
+        For messages only.
+    optional
+        Columns that may be there too; any where None.
+
+    Returns
+    -------
+    list of (where, row)
+        Of every line that is not blank: how a message names it, and its cells by column.
+
+    Raises
+    ------
+    DatasetError
+        Naming the first fault: a column that is absent, unknown, without a name or there twice; a
+        line that is no CSV, or has more or fewer cells than there are columns.
+    """
+    reader = csv.reader(text.splitlines(keepends=True), strict=True)
+    rows = []
+    try:
+        header = [cell.strip().lower() for cell in next(reader, [])]
+        if fault := _fault_of_header(header, required, optional):
+            raise DatasetError(f"{file}: line 1 {fault}")
+        for cells in reader:
+            if any(cell.strip() for cell in cells):
+                where = f"{file}: line {reader.line_num}"
+                if len(cells) != len(header):
+                    raise DatasetError(f"{where} has {len(cells)} cells, not {len(header)}")
+                row = dict(zip(header, (cell.strip() for cell in cells), strict=True))
+                rows.append((where, row))
+    except csv.Error as error:
+        raise DatasetError(f"{file}: line {reader.line_num} is not CSV ({error})") from None
+    return rows
+
+
+def _fault_of_header(
+    header: Sequence[str], required: Collection[str], optional: Collection[str] | None
+) -> str | None:
+    expected = ",".join([*required, *(f"[{name}]" for name in optional or ())])
+    if len(header) == 1 and (";" in header[0] or "\t" in header[0]):
+        return "separates its cells by semicolons or tabs; save it with commas"
+    if absent := [name for name in required if name not in header]:
+        return f"has no column {absent[0]}; expected {expected}"
+    unknown = [name for name in header if name not in (*required, *(optional or ()))]
+    if optional is not None and unknown:
+        return f"has the unknown column {unknown[0]!a}; expected {expected}"
+    if len(set(header)) < len(header) or "" in header:
+        return "names a column twice, or not at all"
+    return None
 
 
 def faults_in(where: Path, expected: str, faults: Sequence[str]) -> str:

@@ -4,12 +4,11 @@ Columns are ``file,age,gender,race,service_test``; ``file`` is a path relative t
 label file. Spreadsheets turn the ages 3-9 and 10-19 into dates; those are repaired here.
 """
 
-import csv
 from dataclasses import dataclass
 from pathlib import Path
 
 from templates.decoys import Attributes
-from verify.datasets import DatasetError
+from verify.datasets import DatasetError, csv_rows, decoded, read_whole
 
 AGES = ("0-2", "3-9", "10-19", "20-29", "30-39", "40-49", "50-59", "60-69", "more than 70")
 GENDERS = ("Male", "Female")
@@ -70,22 +69,12 @@ def read_labels(file: Path) -> dict[Path, Label]:
     DatasetError
         Naming the file, the line, and what was expected.
     """
-    labels: dict[Path, Label] = {}
     folder = file.resolve().parent
-    if file.stat().st_size > _MAX_BYTES:
-        raise DatasetError(f"{file.name} has more than {_MAX_BYTES} bytes; is it a label file?")
-    try:
-        with file.open(encoding="utf-8-sig", newline="") as stream:
-            reader = csv.DictReader(stream)
-            missing = [name for name in _NEEDED if name not in (reader.fieldnames or [])]
-            if missing:
-                raise DatasetError(f"{file.name} lacks the columns {', '.join(missing)}")
-            for row in reader:
-                label = _label(row, where=f"{file.name}, line {reader.line_num}")
-                labels[(folder / row["file"].strip()).resolve()] = label
-    except (UnicodeDecodeError, csv.Error):
-        raise DatasetError(f"{file.name} is not a CSV file in UTF-8") from None
-    return labels
+    text = decoded(read_whole(file, most=_MAX_BYTES), file=file)
+    return {
+        (folder / row["file"]).resolve(): _label(row, where=where)
+        for where, row in csv_rows(file, text, required=_NEEDED)
+    }
 
 
 def _label(row: dict[str, str], *, where: str) -> Label:

@@ -16,7 +16,7 @@ from api.cli.files import read_bounded, read_names
 from api.cli.groups import estimated_labels, group_tables, labels_of
 from api.cli.inputs import fairface_labels, listed_numbers, load_decoys
 from api.cli.photo_folders import people_or_faces
-from api.cli.results import Result, Table, reports
+from api.cli.results import Plan, Result, Table, reports
 from api.cli.verdict import improvements, shown_rate, verdict_lines
 from api.service.opening import file_sealer, open_keyring
 from api.settings import Settings
@@ -150,6 +150,7 @@ def calibrate(
         ),
     ] = 0.05,
     seed: Annotated[int, typer.Option(min=0, help="Seed for the random choices.")] = 0,
+    _plan: Plan = None,
 ) -> Result:
     """Calibrate on labelled people, and write the contract file.
 

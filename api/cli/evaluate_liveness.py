@@ -10,7 +10,7 @@ from api.cli.descriptors import BULK, bulk_pack
 from api.cli.errors import CommandError, UsageError, require_extra
 from api.cli.evaluation_report import LIVENESS_CAPTIONS, write_results
 from api.cli.inputs import listed, load_decoys
-from api.cli.results import Result, Table, reports
+from api.cli.results import Plan, Result, Table, reports
 from api.service.opening import file_sealer, open_keyring
 from api.settings import Settings
 from attacks.impostor_presentations import verify_presentations
@@ -23,12 +23,12 @@ from verify.evaluation.liveness.document import (
     OperatingPoint,
     document,
     markdown,
+    row_cells,
 )
 from verify.evaluation.liveness.presentations import PresentationSet, read_presentations
 from verify.evaluation.liveness.rates import threshold_at_bpcer
 from verify.evaluation.liveness.scores import ScoredSet, score_set
 from verify.evaluation.liveness.verified import VerifiedSet
-from verify.evaluation.markdown_cells import interval_cell, significant
 from verify.evaluation.plan import Json
 from verify.evaluation.provenance import Model
 from verify.preparation import recorded_of
@@ -68,6 +68,7 @@ def evaluate_liveness(
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the templates.")] = 0,
     out: Annotated[Path, typer.Option(help="Folder of the results.")] = Path("liveness"),
+    _plan: Plan = None,
 ) -> Result:
     """Evaluate the pack's liveness graphs on live and attack photos (ISO/IEC 30107-3).
 
@@ -224,18 +225,6 @@ def _verified(
 
 
 def _summary(results: Json) -> Table:
-    dataset = results["dataset"]
-    return Table(
-        f"{dataset['name']}: {dataset['live']} live photos, "
-        f"{sum(dataset['attacks'].values())} attacks",
-        ("threshold of", "threshold", "species", "APCER %", "BPCER %", "IAPMR %"),
-        [
-            (
-                row["operating_point"],
-                significant(row["threshold"]),
-                row["species"] + (" (worst)" if row["worst"] else ""),
-                *(interval_cell(row[name]) for name in ("apcer", "bpcer", "iapmr")),
-            )
-            for row in results["rows"]
-        ],
-    )
+    live, attacks = results["dataset"]["live"], sum(results["dataset"]["attacks"].values())
+    title = f"{results['dataset']['name']}: {live} live photos, {attacks} attacks"
+    return Table(title, *row_cells(results["rows"]))

@@ -44,7 +44,9 @@ def open_all(datasets: Sequence[Path], *, pictures: bool) -> list[VerificationSe
     return sets
 
 
-def wants_raw_flip(asked: tuple[str, ...] | None, embeddings: Path | None, *, flip: bool) -> bool:
+def wants_raw_flip(
+    strategies: tuple[str, ...] | None, embeddings: Path | None, *, flip: bool
+) -> bool:
     """Whether raw embeddings with the mirror image are compared beside the others.
 
     Raises
@@ -52,14 +54,14 @@ def wants_raw_flip(asked: tuple[str, ...] | None, embeddings: Path | None, *, fl
     UsageError
         They are asked for, and there is nothing to compute them with or to compare them with.
     """
-    if asked is None:
+    if strategies is None:
         return embeddings is None and not flip
-    if RAW_FLIP in asked and (embeddings is not None or flip):
+    if RAW_FLIP in strategies and (embeddings is not None or flip):
         raise UsageError(
             f"{RAW_FLIP} is raw embeddings with the mirror image added, beside raw ones without: "
             "it needs a pack, and no --flip"
         )
-    return RAW_FLIP in asked
+    return RAW_FLIP in strategies
 
 
 def open_embedder(

@@ -36,10 +36,9 @@ def predict_attributes(descriptors: NDArray[np.float32], pool: DecoyPool) -> lis
     Raises
     ------
     DecoyError
-        The pool has no labels, or its descriptors have another dimension.
+        The pool has no labels.
     """
     entries, labels = pool.entries
-    _require_dimension(descriptors, pool)
     if labels is None:
         raise DecoyError(
             "attributes are predicted from a labelled decoy pool, and this one has no labels; "
@@ -122,31 +121,6 @@ def voted(
     return chosen
 
 
-def resembling(
-    pool: DecoyPool, descriptors: NDArray[np.float32], *, cosine: float
-) -> NDArray[np.int64]:
-    """Find the entries of a pool that may show people of a set; their numbers, ascending.
-
-    A person in the pool lies in every template that their descriptor is a decoy of (docs/method.md
-    §4.3): people of the test set are excluded from the decoys before it is evaluated.
-
-    Parameters
-    ----------
-    descriptors : (N, n) float32
-        Unit rows, of the set.
-    cosine
-        An entry resembles a face where the cosine of the two is at least this.
-
-    Raises
-    ------
-    DecoyError
-        The pool's descriptors have another dimension.
-    """
-    entries, _ = pool.entries
-    _require_dimension(descriptors, pool)
-    return resembling_rows(entries, descriptors, cosine=cosine)
-
-
 def resembling_rows(
     rows: NDArray[np.float32], others: NDArray[np.float32], *, cosine: float
 ) -> NDArray[np.int64]:
@@ -164,11 +138,3 @@ def resembling_rows(
             cosines = tile @ others[other : other + _ROWS].T
             resembles[start : start + _ROWS] |= (cosines >= np.float64(cosine)).any(axis=1)
     return np.flatnonzero(resembles).astype(np.int64)
-
-
-def _require_dimension(descriptors: NDArray[np.float32], pool: DecoyPool) -> None:
-    if descriptors.ndim != 2 or descriptors.shape[1] != pool.n:
-        raise DecoyError(
-            f"the decoy pool has embeddings of {pool.n} numbers, and the set has the shape "
-            f"{descriptors.shape}; use decoys that were made with the same pack"
-        )

@@ -5,13 +5,12 @@ The first column is ``path`` or ``file``; every other column is an attribute, su
 suffix), or all photos of a person, by the name of the person's folder.
 """
 
-import csv
 from bisect import bisect_right
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
-from verify.datasets import SUFFIXES, DatasetError, decoded, read_whole
+from verify.datasets import SUFFIXES, DatasetError, csv_rows, decoded, read_whole
 from verify.fairface_labels import repaired_age
 
 MAX_BYTES = 16 * 2**20
@@ -30,28 +29,15 @@ class Labels:
     Parameters
     ----------
     of
-        By the path or name of a row: its labels by attribute; an empty cell is absent.
+        By the path or name of a row, and by that without suffix: its labels by attribute. An empty
+        cell is absent.
     """
 
     attributes: tuple[str, ...]
     of: Mapping[str, Mapping[str, str]]
-    _stems: Mapping[str, Mapping[str, str]] = field(init=False, compare=False)
-
-    def __post_init__(self) -> None:
-        names: dict[str, list[str]] = {}
-        for name in self.of:
-            names.setdefault(_stem(name), []).append(name)
-        # Where rows differ in their suffix only, each speaks for its own file alone; a row
-        # without suffix speaks for the others.
-        speakers = {
-            stem: own[0] if len(own) == 1 else stem
-            for stem, own in names.items()
-            if len(own) == 1 or stem in own
-        }
-        object.__setattr__(self, "_stems", {stem: self.of[name] for stem, name in speakers.items()})
 
     def __repr__(self) -> str:
-        return f"Labels({len(self.of)} rows of {', '.join(self.attributes)})"
+        return f"Labels({', '.join(self.attributes)})"
 
     def find(self, picture: str) -> Mapping[str, str]:
         """Labels of a picture by its name in the set; empty where no row speaks of it.
@@ -60,10 +46,9 @@ class Labels:
         of the nearest folder.
         """
         name = _normal(picture)
-        if name in self.of:
-            return self.of[name]
-        if _stem(name) in self._stems:
-            return self._stems[_stem(name)]
+        for key in (name, _stem(name)):
+            if key in self.of:
+                return self.of[key]
         folder = name.rpartition("/")[0]
         while folder:
             above, _, alone = folder.rpartition("/")
@@ -91,51 +76,39 @@ def read_labels(file: Path | str) -> Labels:
         a path, two rows of one path that differ, an attribute with too many labels.
     """
     path = Path(file)
-    text = decoded(read_whole(path, most=MAX_BYTES), file=path)
-    reader = csv.reader(text.splitlines(keepends=True), strict=True)
-    try:
-        attributes = _attributes(path, [cell.strip().lower() for cell in next(reader, [])])
-        of: dict[str, dict[str, str]] = {}
-        groups: dict[str, set[str]] = {attribute: set() for attribute in attributes}
-        for line in reader:
-            cells = [cell.strip() for cell in line]
-            if not any(cells):
-                continue
-            where = f"{path.name}: line {reader.line_num}"
-            if len(cells) != len(attributes) + 1:
-                header = len(attributes) + 1
-                raise DatasetError(f"{where} has {len(cells)} cells, and the header {header}")
-            name, labels = _normal(cells[0]), _labels(attributes, cells[1:])
-            if not name:
-                raise DatasetError(f"{where} has no path")
-            if of.setdefault(name, labels) != labels:
-                raise DatasetError(f"{where} labels {name} otherwise than a line before it")
-            for attribute, label in labels.items():
-                groups[attribute].add(label)
-                if len(groups[attribute]) > MAX_GROUPS:
-                    raise DatasetError(
-                        f"{path.name}: the column {attribute} has more than {MAX_GROUPS} different "
-                        "labels, which are names or numbers and no groups: remove the column, or "
-                        "put its values into ranges"
-                    )
-    except csv.Error as error:
-        raise DatasetError(f"{path.name} cannot be read as a CSV file ({error})") from None
-    if not of:
-        raise DatasetError(f"{path.name} has no row below the header")
-    return Labels(tuple(name for name in attributes if name != _NO_ATTRIBUTE), of)
+    rows = csv_rows(path, decoded(read_whole(path, most=MAX_BYTES), file=path), required=())
+    if not rows:
+        raise DatasetError(f"{path} has no row below the header")
+    key, *columns = rows[0][1]
+    attributes = tuple(name for name in columns if name != _NO_ATTRIBUTE)
+    if key not in ("path", "file") or not attributes:
+        raise DatasetError(
+            f"{path}: the first column is path or file, and one attribute at least follows, such "
+            "as gender"
+        )
+    of: dict[str, dict[str, str]] = {}
+    for where, row in rows:
+        name = _normal(row[key])
+        if not name:
+            raise DatasetError(f"{where} has no path")
+        labels = {attribute: row[attribute] for attribute in attributes if row[attribute]}
+        if "age" in labels:
+            labels["age"] = _age(labels["age"])
+        if of.setdefault(name, labels) != labels:
+            raise DatasetError(f"{where} labels {name} otherwise than a line before it")
+    for attribute in attributes:
+        if len({labels.get(attribute) for labels in of.values()} - {None}) > MAX_GROUPS:
+            raise DatasetError(
+                f"{path}: the column {attribute} has more than {MAX_GROUPS} different labels, which"
+                " are names or numbers and no groups: remove the column, or put its values into"
+                " ranges"
+            )
+    return Labels(attributes, {**{_stem(name): labels for name, labels in of.items()}, **of})
 
 
-def _labels(attributes: Sequence[str], cells: Sequence[str]) -> dict[str, str]:
-    labels = {
-        attribute: cell
-        for attribute, cell in zip(attributes, cells, strict=True)
-        if cell and attribute != _NO_ATTRIBUTE
-    }
-    if "age" in labels:
-        age = labels["age"]
-        is_years = len(age) <= 3 and age.isdecimal()
-        labels["age"] = repaired_age(age) or (age_group(int(age)) if is_years else age)
-    return labels
+def _age(cell: str) -> str:
+    is_years = len(cell) <= 3 and cell.isdecimal()
+    return repaired_age(cell) or (age_group(int(cell)) if is_years else cell)
 
 
 def age_group(years: int) -> str:
@@ -144,23 +117,6 @@ def age_group(years: int) -> str:
     if place == len(YEARS):
         return f"{YEARS[-1]} and more"
     return f"{YEARS[place - 1]}-{YEARS[place] - 1}"
-
-
-def _attributes(path: Path, header: Sequence[str]) -> list[str]:
-    if not header or header[0] not in ("path", "file"):
-        raise DatasetError(
-            f"the first column of {path.name} is not path or file; expected a header such as "
-            "path,gender,race,age"
-        )
-    attributes = list(header[1:])
-    if not set(attributes) - {_NO_ATTRIBUTE} or "" in attributes:
-        raise DatasetError(
-            f"{path.name} needs a name for each column, and one attribute at least beside the "
-            "path, such as gender"
-        )
-    if len(set(attributes)) != len(attributes):
-        raise DatasetError(f"{path.name} has two columns of the same name")
-    return attributes
 
 
 def _normal(name: str) -> str:

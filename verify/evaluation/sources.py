@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from templates.decoys import DecoyPool
-from verify.evaluation.attributes import resembling
+from verify.evaluation.attributes import resembling_rows
 from verify.evaluation.comparison import Trials
 from verify.evaluation.embedding import EmbeddedSet
 from verify.evaluation.plan import EvaluationError, Json, Source, decoy_kind
@@ -62,7 +62,7 @@ def without_test_people(
         if not isinstance(pool, DecoyPool):
             kept.append(facts)
             continue
-        alike = resembling(pool, faces.embeddings, cosine=SAME_PERSON)
+        alike = resembling_rows(pool.entries[0], faces.embeddings, cosine=SAME_PERSON)
         if len(alike) == len(pool):
             raise EvaluationError(
                 f"every face of {facts.file} resembles one of {faces.pairs.name}; build it from "

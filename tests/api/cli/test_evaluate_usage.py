@@ -47,7 +47,7 @@ FAILED: list[tuple[list[str], str]] = [
     ),
     (["--decoys", "ABSENT"], "absent: No such file or directory"),
     (["--labels", "ABSENT"], "absent is not there"),
-    (["--labels", "AUDIT"], "the first column of audit.json is not path or file"),
+    (["--labels", "AUDIT"], "audit.json has no row below the header"),
 ]
 
 

@@ -23,7 +23,7 @@ from verify.evaluation.markdown_cells import (
 )
 from verify.evaluation.plan import Json
 from verify.evaluation.provenance import Model, software
-from verify.evaluation.tables import failure_list
+from verify.evaluation.tables import Cells, failure_list
 from verify.metrics import equal_error_rate, error_curve
 
 FORMAT = "veilface liveness evaluation"
@@ -143,25 +143,43 @@ def _curve(live: ArrayLike, attacks: ArrayLike, species: str) -> Json:
     return {"species": species, **rates}
 
 
+def row_cells(rows: Sequence[Json]) -> Cells:
+    """Say what the rates are of each species at each threshold."""
+    rates = {
+        "APCER %": "apcer",
+        "BPCER %": "bpcer",
+        "IAPMR % without liveness": "iapmr_without_liveness",
+        "IAPMR %": "iapmr",
+        "FRR %": "frr",
+    }
+    lines = [
+        [
+            plain(row["operating_point"]),
+            significant(row["threshold"]),
+            plain(row["species"]) + (" (worst)" if row["worst"] else ""),
+            *(interval_cell(row[name]) for name in rates.values()),
+        ]
+        for row in rows
+    ]
+    return ["threshold of", "threshold", "species", *rates], lines
+
+
 def markdown(results: Json) -> str:
     """Return the report. It has no date, so that the same run gives the same text."""
-    dataset = results["dataset"]
-    parts = [f"# Presentation attack detection: {plain(dataset['name'])}", _provenance(results)]
-    for name, rows in _by_point(results):
-        rates = _table(rows, ("apcer", "bpcer"), ("APCER %", "BPCER %"))
-        parts += [f"## {_title(name)}", _headline(rows), rates]
-    parts += ["## Through the whole verification", *_through(results)]
-    parts += ["## Photos without a face", *_non_responses(results)]
+    titles, lines = row_cells(results["rows"])
+    parts = [
+        f"# Presentation attack detection: {plain(results['dataset']['name'])}",
+        _provenance(results),
+        *(_headline(row) for row in results["rows"] if row["worst"]),
+        table(titles, lines, [title in ("threshold of", "species") for title in titles]),
+        _through(results["verification"]),
+        "## Photos without a face",
+        *_non_responses(results),
+    ]
     if results["refused"]:
         parts.append("## Not reported")
         parts.append("\n".join(f"- {plain(sentence)}" for sentence in results["refused"]))
-    parts.append(HOW_TO_READ)
-    return "\n\n".join(parts) + "\n"
-
-
-def _by_point(results: Json) -> list[tuple[str, list[Json]]]:
-    names = dict.fromkeys(row["operating_point"] for row in results["rows"])
-    return [(n, [row for row in results["rows"] if row["operating_point"] == n]) for n in names]
+    return "\n\n".join([*parts, HOW_TO_READ]) + "\n"
 
 
 HOW_TO_READ = """## How to read this
@@ -172,12 +190,6 @@ HOW_TO_READ = """## How to read this
 - D-EER: where APCER and BPCER are equal, or nearest to it.
 - IAPMR (IAPAR, its rate of acceptance by the full system, in ISO/IEC 30107-3:2023): share of the attacks with a photo of an enrolled person that the whole verification accepts for that person; a photo without a face is not accepted.
 - Another camera, light or attack gives other rates (docs/liveness.md)."""  # noqa: E501
-
-
-def _title(name: str) -> str:
-    if name == CONTRACT_POINT:
-        return "At the contract's threshold"
-    return f"Threshold set on these photos, BPCER at most {percent(float(name.split('-', 1)[1]))} %"
 
 
 def _provenance(results: Json) -> str:
@@ -198,36 +210,26 @@ def _provenance(results: Json) -> str:
     return "\n".join(f"- {line}" for line in lines)
 
 
-def _headline(rows: Sequence[Json]) -> str:
-    worst = next(row for row in rows if row["worst"])
+def _headline(worst: Json) -> str:
+    point = worst["operating_point"]
+    whose = "At the contract's threshold" if point == CONTRACT_POINT else f"At {plain(point)}"
     return (
-        f"**APCER, in %: {interval_cell(worst['apcer'])}** (worst species: "
+        f"**{whose}: APCER, in %: {interval_cell(worst['apcer'])}** (worst species: "
         f"{plain(worst['species'])}); BPCER: {interval_cell(worst['bpcer'])}; threshold "
         f"{significant(worst['threshold'])}."
     )
 
 
-def _table(rows: Sequence[Json], names: Sequence[str], titles: Sequence[str]) -> str:
-    """Return a table of rates by species."""
-    lines = [[plain(row["species"]), *(interval_cell(row[name]) for name in names)] for row in rows]
-    return table(["species", *titles], lines, [True, *(False for _ in names)])
-
-
-def _through(results: Json) -> list[str]:
-    facts = results["verification"]
+def _through(facts: Json) -> str:
     if not facts["measured"]:
-        return [f"IAPMR was not measured: {plain(facts['reason'])}."]
+        return f"IAPMR was not measured: {plain(facts['reason'])}."
     left_out = f"; left out: {', '.join(map(plain, facts['left_out']))}" * bool(facts["left_out"])
-    titles = ("IAPMR % without liveness", "IAPMR %", "FRR %")
-    return [
-        f"Level {plain(facts['level'])}; {count(facts['enrolled_subjects'])} subjects enrolled by "
+    return (
+        f"Through the whole verification: level {plain(facts['level'])}; "
+        f"{count(facts['enrolled_subjects'])} subjects enrolled by "
         f"{count(facts['enrolled_photos'])} live photos each{left_out}. FRR of their other live "
-        f"photos without liveness, in %: {interval_cell(facts['frr'])}.",
-        *(
-            f"{_title(name)}:\n\n{_table(rows, ('iapmr_without_liveness', 'iapmr', 'frr'), titles)}"
-            for name, rows in _by_point(results)
-        ),
-    ]
+        f"photos without liveness, in %: {interval_cell(facts['frr'])}."
+    )
 
 
 def _non_responses(results: Json) -> list[str]:

@@ -1,18 +1,16 @@
 """Sets of bona fide and attack presentations: a folder ``live/``, ``spoof/SPECIES/``, or a CSV."""
 
-import csv
 import re
 from dataclasses import dataclass
 from pathlib import Path
 
 from templates.contract.liveness import SPECIES_NAME
-from verify.datasets import DatasetError, is_photo, visible
+from verify.datasets import DatasetError, csv_rows, is_photo, visible
 from verify.evaluation.readers.reader import read_text
 
 LIVE = "live"
 ATTACKS = "spoof"
-REQUIRED = {"path", "presentation"}
-COLUMNS = {*REQUIRED, "subject"}
+REQUIRED = ("path", "presentation")
 FOLDER = f"expected {LIVE}/ and {ATTACKS}/SPECIES/ with photos in them"
 TABLE = "expected path,presentation[,subject], where presentation is live or names the species"
 _NUMBERED = re.compile(r"([0-9]{2,})_")
@@ -129,27 +127,15 @@ def _folder(root: Path) -> list[Presentation]:
 
 def _csv(file: Path) -> list[Presentation]:
     text = read_text(file, root=file.parent).text
-    reader = csv.reader(text.splitlines(keepends=True), strict=True)
     presentations: dict[str, Presentation] = {}
-    try:
-        header = [cell.strip().lower() for cell in next(reader, [])]
-        if not REQUIRED <= {*header} <= COLUMNS or len({*header}) < len(header):
-            raise DatasetError(f"{file}: line 1 has the columns {', '.join(header)!a}; {TABLE}")
-        for cells in reader:
-            if any(cell.strip() for cell in cells):
-                where = f"{file}: line {reader.line_num}"
-                if len(cells) != len(header):
-                    raise DatasetError(f"{where} has {len(cells)} cells, not {len(header)}")
-                row = dict(zip(header, (cell.strip() for cell in cells), strict=True))
-                if fault := _fault_of(file, row):
-                    raise DatasetError(f"{where} {fault}")
-                name, kind, subject = row["path"], row["presentation"], row.get("subject") or None
-                if name in presentations:
-                    raise DatasetError(f"{where}: {name} is named twice")
-                species = None if kind == LIVE else kind
-                presentations[name] = Presentation(file.parent / name, name, species, subject)
-    except csv.Error as error:
-        raise DatasetError(f"{file}: line {reader.line_num} is not CSV ({error})") from None
+    for where, row in csv_rows(file, text, required=REQUIRED, optional=("subject",)):
+        if fault := _fault_of(file, row):
+            raise DatasetError(f"{where} {fault}")
+        name, kind = row["path"], row["presentation"]
+        if name in presentations:
+            raise DatasetError(f"{where}: {name} is named twice")
+        species, subject = None if kind == LIVE else kind, row.get("subject") or None
+        presentations[name] = Presentation(file.parent / name, name, species, subject)
     return list(presentations.values())
 
 

@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.extraction import Photo
-from verify.datasets import SUFFIXES, DatasetError, faults_in, read_whole
+from verify.datasets import SUFFIXES, DatasetError, Trial, faults_in, read_whole
 from verify.evaluation.readers.reader import (
     Reader,
-    Trial,
     assemble,
     isolated,
     keys_of,

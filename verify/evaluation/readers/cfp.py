@@ -5,11 +5,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from models.extraction import Photo
-from verify.datasets import DatasetError, faults_in, is_photo
+from verify.datasets import DatasetError, Trial, faults_in, is_photo
 from verify.evaluation.readers.reader import (
     ProtocolText,
     Reader,
-    Trial,
     assemble,
     keys_of,
     read_text,

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from models.extraction import Photo
-from verify.datasets import DatasetError, read_whole
-from verify.evaluation.readers.reader import Reader, Trial, assemble, isolated
+from verify.datasets import DatasetError, Trial, read_whole
+from verify.evaluation.readers.reader import Reader, assemble, isolated
 from verify.evaluation.verification_set import (
     VerificationSet,
     contiguous_folds,
@@ -36,9 +36,9 @@ def read_bin(path: Path, _: bool) -> list[VerificationSet]:
     """
     photos, same, sha256 = isolated(read_content, path)
     name_of: dict[bytes, str] = {}
-    named = [name_of.setdefault(photo, f"{place:05d}") for place, photo in enumerate(photos)]
+    names = [name_of.setdefault(photo, f"{place:05d}") for place, photo in enumerate(photos)]
     trials = [
-        Trial(named[2 * pair], named[2 * pair + 1], answer, int(fold))
+        Trial(names[2 * pair], names[2 * pair + 1], answer, int(fold))
         for pair, (answer, fold) in enumerate(
             zip(same, contiguous_folds(len(same)).tolist(), strict=True)
         )
@@ -182,8 +182,8 @@ class _Unpickler(pickle.Unpickler):
 
     def find_class(self, module: str, name: str) -> Any:
         if f"{module}.{name}" not in _ALLOWED:
-            asked = f"{module}.{name}"[:100]
-            raise pickle.UnpicklingError(f"it asks for {asked!a}; nothing was run")
+            wanted = f"{module}.{name}"[:100]
+            raise pickle.UnpicklingError(f"it asks for {wanted!a}; nothing was run")
         return _ALLOWED[f"{module}.{name}"]
 
 

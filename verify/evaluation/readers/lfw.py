@@ -6,7 +6,6 @@ from models.extraction import Photo
 from verify.datasets import DatasetError, parse_lfw_pairs
 from verify.evaluation.readers.reader import (
     Reader,
-    Trial,
     assemble,
     keys_of,
     photos_named,
@@ -33,11 +32,10 @@ def read_lfw(root: Path, pictures: bool) -> list[VerificationSet]:
     Huang, Ramesh, Berg, Learned-Miller, "Labeled Faces in the Wild", UMass TR 07-49, 2007.
     """
     protocol = read_text(root / PAIRS, root=root)
-    pairs = parse_lfw_pairs(root / PAIRS, protocol.text)
-    people = {person for pair in pairs for person, _ in (pair.first, pair.second)}
-    require_plain_names(root / PAIRS, people)
-    trials = [Trial("/".join(one.first), "/".join(one.second), one.same, one.fold) for one in pairs]
+    trials = parse_lfw_pairs(root / PAIRS, protocol.text)
     keys = keys_of(trials)
+    require_plain_names(root / PAIRS, (part for key in keys for part in key.split("/")))
+    people = {key.split("/")[0] for key in keys}
     files = {key: Photo(f"{key}.jpg", root / f"{key}.jpg") for key in keys}
     if pictures:
         base = _photo_root(root, people)

@@ -3,21 +3,19 @@
 import csv
 import os.path
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from models.extraction import Photo
-from verify.datasets import DatasetError, faults_in, is_photo, visible
-from verify.evaluation.readers.reader import Reader, Trial, assemble, keys_of, read_text
+from verify.datasets import DatasetError, Trial, csv_rows, faults_in, is_photo, visible
+from verify.evaluation.readers.reader import Reader, assemble, keys_of, read_text
 from verify.evaluation.verification_set import VerificationSet
 from verify.tenfold import FOLDS
 
 REQUIRED = ("path_a", "path_b", "same")
 _PEOPLE = ("person_a", "person_b")
-_COLUMNS = (*REQUIRED, "fold", *_PEOPLE)
 _ANSWERS = {"1": True, "true": True, "yes": True, "0": False, "false": False, "no": False}
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://")
-EXPECTED = "expected path_a,path_b,same[,fold][,person_a,person_b]"
 
 
 def read_pair_csv(path: Path, pictures: bool) -> list[VerificationSet]:
@@ -36,7 +34,9 @@ def read_pair_csv(path: Path, pictures: bool) -> list[VerificationSet]:
     names: dict[str, str] = {}
     trials: list[Trial] = []
     people: dict[str, str] = {}
-    for where, row in _rows(path, text.text):
+    for where, row in csv_rows(path, text.text, required=REQUIRED, optional=("fold", *_PEOPLE)):
+        if fault := _fault_of(row):
+            raise DatasetError(f"{where} {fault}")
         # Two spellings of one path are one photo, under the first of them.
         first, second = (
             names.setdefault(_place(path, row[column]), row[column])
@@ -81,38 +81,6 @@ def _place(path: Path, cell: str) -> str:
     return os.path.normpath(path.parent / cell)
 
 
-def _rows(path: Path, text: str) -> Iterator[tuple[str, dict[str, str]]]:
-    """Give each line that is not empty, checked, and how a message names it."""
-    reader = csv.reader(text.splitlines(keepends=True), strict=True)
-    try:
-        header = [cell.strip().lower() for cell in next(reader, [])]
-        if fault := _fault_of_header(header):
-            raise DatasetError(f"{path}: line 1 {fault}; {EXPECTED}")
-        for cells in reader:
-            if any(cell.strip() for cell in cells):
-                where = f"{path}: line {reader.line_num}"
-                if len(cells) != len(header):
-                    raise DatasetError(f"{where} has {len(cells)} cells, not {len(header)}")
-                row = dict(zip(header, (cell.strip() for cell in cells), strict=True))
-                if fault := _fault_of(row):
-                    raise DatasetError(f"{where} {fault}")
-                yield where, row
-    except csv.Error as error:
-        raise DatasetError(f"{path}: line {reader.line_num} is not CSV ({error})") from None
-
-
-def _fault_of_header(header: Sequence[str]) -> str | None:
-    if len(header) == 1 and (";" in header[0] or "\t" in header[0]):
-        return "separates its cells by semicolons or tabs; save it with commas"
-    if absent := [name for name in REQUIRED if name not in header]:
-        return f"has no column {absent[0]}"
-    if unknown := [name for name in header if name not in _COLUMNS]:
-        return f"has the unknown column {unknown[0]!a}"
-    if len(set(header)) < len(header):
-        return "names a column twice"
-    return "has only one of person_a and person_b" if len(set(header) & {*_PEOPLE}) == 1 else None
-
-
 def _fault_of(row: dict[str, str]) -> str | None:
     for column in ("path_a", "path_b"):
         if not row[column] or not row[column].isprintable():
@@ -124,6 +92,8 @@ def _fault_of(row: dict[str, str]) -> str | None:
     fold = row.get("fold", "0")
     if not fold.isascii() or not fold.isdecimal() or len(fold) > 2 or int(fold) > FOLDS:
         return "has no fold of 1 to 10, or of 0 to 9"
+    if len(row.keys() & {*_PEOPLE}) == 1:
+        return "has only one of person_a and person_b"
     nameless = [column for column in _PEOPLE if row.get(column) == ""]
     return f"has no name in {nameless[0]}" if nameless else None
 

@@ -20,6 +20,7 @@ from verify.datasets import (
     MAX_PAIRS_BYTES,
     SUFFIXES,
     DatasetError,
+    Trial,
     decoded,
     faults_in,
     is_photo,
@@ -59,16 +60,6 @@ class Reader:
     layout: str
     recognises: Callable[[Path], bool]
     read: Callable[[Path, bool], list[VerificationSet]]
-
-
-@dataclass(frozen=True)
-class Trial:
-    """One comparison of a protocol; photos by a key that is unique in the set."""
-
-    first: str
-    second: str
-    same: bool
-    fold: int | None = None
 
 
 @dataclass(frozen=True)

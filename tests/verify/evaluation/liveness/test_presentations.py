@@ -87,8 +87,8 @@ def test_faults_of_a_folder_are_named(tmp_path, names, said):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("path,label\n", "has the columns 'path, label'"),
-        ("path,path,presentation\n", "has the columns 'path, path, presentation'"),
+        ("path,label\n", "has no column presentation"),
+        ("path,path,presentation\n", "names a column twice"),
         ("path,presentation\na.jpg\n", "line 2 has 1 cells, not 2"),
         ("path,presentation\n,live\n", "line 2 has no path"),
         ("path,presentation\nz.jpg,live\n", "line 2 names z.jpg, which is not there"),
