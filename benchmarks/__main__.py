@@ -12,7 +12,6 @@ from collections.abc import Mapping, Sequence
 NAMES = {
     "browser_client": "the JavaScript client in Chromium, and what leaves the browser",
     "end_to_end": "FRR and FMR of the running service on LFW, by photos or lifted probes",
-    "insightface_agreement": "key points, crops and embeddings beside InsightFace's own code",
     "operating_point": "what privacy costs: theft and false rejections by the photos spared",
     "readme_results": "the table of docs/evaluation.md, from results of veilface evaluate",
     "request_overhead": "a verification by photo beside the bare models",

@@ -71,10 +71,11 @@ def read_labels(file: Path) -> dict[Path, Label]:
     """
     folder = file.resolve().parent
     text = decoded(read_whole(file, most=_MAX_BYTES), file=file)
-    return {
-        (folder / row["file"]).resolve(): _label(row, where=where)
-        for where, row in csv_rows(file, text, required=_NEEDED)
-    }
+    labels = {}
+    for where, row in csv_rows(file, text, required=_NEEDED):
+        label = _label(row, where=where)
+        labels[(folder / row["file"]).resolve()] = label
+    return labels
 
 
 def _label(row: dict[str, str], *, where: str) -> Label:

@@ -88,13 +88,6 @@ def test_cmyk_jpeg_is_converted():
     np.testing.assert_array_equal(decode_image(bare), decode_image(marked))
 
 
-def test_a_phone_picture_with_several_frames_gives_the_first():
-    first, second = Image.fromarray(picture()), Image.new("RGB", (60, 40))
-    data = encode(first, "MPO", save_all=True, append_images=[second], quality=95)
-    assert Image.open(io.BytesIO(data)).format == "MPO"
-    assert np.abs(decode_image(data).astype(int) - picture()).mean() < 3
-
-
 @pytest.mark.parametrize("kind", ["PNG", "WEBP"])
 def test_animations_are_refused_by_name(kind):
     frames = [Image.new("RGB", (20, 20), (60 * i, 0, 0)) for i in range(3)]

@@ -1,7 +1,7 @@
 """Agreement with InsightFace at an equal canvas, against a plain statement of what it does.
 
-The package itself is compared by `benchmarks/insightface_agreement.py`: it asks for
-`opencv-python`, which would replace the headless OpenCV of every other test.
+The package itself is not installed: it asks for `opencv-python`, which would replace the headless
+OpenCV of every other test.
 """
 
 import cv2

@@ -6,8 +6,6 @@ import shutil
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from PIL import Image
 
 from models.alignment import template
@@ -116,25 +114,6 @@ def expects(**changes: object) -> LivenessInput:
 )
 def test_a_box_grows_into_the_frame(frame, box, scale, region):
     assert box_region(frame, box, scale) == region
-
-
-@given(
-    st.integers(20, 400),
-    st.integers(20, 400),
-    st.floats(0.6, 6),
-    st.lists(st.floats(0, 1), min_size=4, max_size=4),
-)
-def test_the_region_of_a_box_is_in_the_frame_and_keeps_its_shape(width, height, scale, places):
-    x1, x2 = sorted(np.array(places[:2]) * (width - 2))
-    y1, y2 = sorted(np.array(places[2:]) * (height - 2))
-    box = (x1, y1, x2 + 2, y2 + 2)
-    left, top, right, bottom = box_region((width, height), box, scale)
-    assert 0 <= left < right <= width
-    assert 0 <= top < bottom <= height
-    sides = (box[2] - box[0], box[3] - box[1])
-    most = min(scale, (width - 1) / sides[0], (height - 1) / sides[1])
-    assert right - left == pytest.approx(sides[0] * most + 1, abs=1.01)
-    assert bottom - top == pytest.approx(sides[1] * most + 1, abs=1.01)
 
 
 @pytest.mark.parametrize("scale", [1.0, 2.7, 4.0])

@@ -2,7 +2,6 @@ import cv2
 import numpy as np
 import pytest
 
-from models.alignment import TEMPLATE_112
 from models.decoding import decode_image
 from models.errors import FaceError, FaceTooSmall, LowQuality
 from models.pack import ModelPack
@@ -17,9 +16,6 @@ from models.quality import (
 from models.selection import FacePolicy
 from models.synthetic import encode_photo
 
-# A head in millimetres: eyes, nose and mouth as the alignment template has them (1.8 mm per pixel),
-# the nose 22 mm in front. x to the right of the picture, y down, z towards the camera.
-HEAD = np.column_stack([(TEMPLATE_112 - TEMPLATE_112.mean(0)) * 1.8, [0, 0, 22, 0, 0]])
 GOOD = Quality(
     score=0.9,
     face_size=100.0,
@@ -32,12 +28,6 @@ GOOD = Quality(
     border=0.5,
     aspect=1.4,
 )
-
-
-def test_points_that_coincide_but_two_do_not_divide_by_zero():
-    points = np.zeros((5, 2))
-    points[4] = 1
-    assert np.isfinite(measure_pose(points)).all()
 
 
 def texture(seed: int = 0) -> np.ndarray:
@@ -68,10 +58,6 @@ def test_sharpness_falls_with_blur_and_ignores_exposure_and_contrast():
     assert all(np.diff([measure_sharpness(sharp), *values]) < 0)
     soft = (sharp * 0.4 + 10).astype(np.uint8)
     assert measure_sharpness(soft) == pytest.approx(measure_sharpness(sharp), rel=0.05)
-
-
-def test_a_flat_picture_has_no_detail():
-    assert measure_sharpness(np.full((112, 112), 77, np.uint8)) == 0.0
 
 
 def test_measures_do_not_depend_on_the_embedders_size():

@@ -225,10 +225,12 @@ def test_lifted_probes_are_decided(
 def test_lifted_probes_that_are_not_honest_are_refused(
     contract: Contract, verifier: Verifier, stored: list[Enrollment]
 ) -> None:
-    central = SubspaceBatch(np.zeros(K, dtype=np.float32), np.eye(K, dtype=np.float32)[:2])
-    data = wire.encode(central, contract_id=contract.contract_id)
-    with pytest.raises(InvalidTemplate, match="foot point is outside the range"):
-        verifier.decide_template(data, stored[0])
+    for norm in (0.999, 0.0):
+        foot = norm * np.eye(K, dtype=np.float32)[2]
+        unlikely = SubspaceBatch(foot, np.eye(K, dtype=np.float32)[:2])
+        data = wire.encode(unlikely, contract_id=contract.contract_id)
+        with pytest.raises(InvalidTemplate, match="foot point is outside the range"):
+            verifier.decide_template(data, stored[0])
     with pytest.raises(Uncalibrated, match="probe m = 3; calibrated are"):
         verifier.decide_template(lifted(contract, NEW.descriptors[0], m=3), stored[0])
     with pytest.raises(ContractMismatch):

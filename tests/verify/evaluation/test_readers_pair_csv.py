@@ -112,7 +112,7 @@ def test_people(tmp_path: Path) -> None:
         (table("path_a,path_b", SAME, OTHER), "no column same"),
         (table(f"{HEADER},score", SAME, OTHER), "unknown column 'score'"),
         (table(f"{HEADER},same", SAME, OTHER), "names a column twice"),
-        (table(f"{HEADER},person_a", SAME, OTHER), "only one of person_a"),
+        (table(f"{HEADER},person_a", f"{SAME},Ann", f"{OTHER},Ann"), "only one of person_a"),
         (table(HEADER, SAME, OTHER).replace(",", ";"), "save it with commas"),
         (HEADER, "holds no pair"),
         ("", "no column path_a"),

@@ -1,24 +1,21 @@
 """Runs, rows and curves against means, intervals and counts that are made anew."""
 
-import json
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from models.extraction import Failure, Photo
+from models.extraction import Failure
 from templates.distances import Metric
+from tests.verify.evaluation.made_results import made_faces, made_results, verification_set
 from tests.verify.evaluation.made_trials import N, made_trials, pool
 from verify.datasets import DatasetError
 from verify.evaluation.comparison import Trials
-from verify.evaluation.embedding import EmbeddedSet
 from verify.evaluation.experiment import (
     ROW,
-    SetResult,
     averaged,
     run_trials,
     trials_of,
@@ -26,11 +23,9 @@ from verify.evaluation.experiment import (
 from verify.evaluation.intervals import replicate_weights
 from verify.evaluation.plan import EvaluationPlan, Mode
 from verify.evaluation.provenance import Model
-from verify.evaluation.results import collision_floor, document, row_of
-from verify.evaluation.verification_set import VerificationSet
+from verify.evaluation.results import collision_floor, row_of
 from verify.metrics import threshold_at_fmr, wilson
 
-PLAN = EvaluationPlan(("raw", "random", "adversarial"), dims=(2, 3), repeats=2, targets=(0.1, 1e-4))
 # One kind of run whose lifts differ much, so that the draw of runs shows.
 SPREAD = EvaluationPlan(
     ("adversarial",),
@@ -44,52 +39,21 @@ SPREAD = EvaluationPlan(
 )
 
 
-def verification_set(pairs: int = 100, people: int = 30) -> VerificationSet:
-    known = made_trials(people=people, pairs=pairs)
-    return VerificationSet(
-        name="made",
-        kind="pairs",
-        pictures=tuple(Photo(f"{i}", b"") for i in range(2 * people)),
-        first=known.first,
-        second=known.second,
-        same=known.same,
-        folds=known.folds,
-        people=tuple(f"p{i // 2}" for i in range(2 * people)),
-    )
-
-
-def run(plan: EvaluationPlan = PLAN, trials: Trials | None = None) -> pd.DataFrame:
+def run(plan: EvaluationPlan, trials: Trials | None = None) -> pd.DataFrame:
     with ThreadPoolExecutor(2) as executor:
         return run_trials(trials or made_trials(), plan, executor=executor, progress=lambda _: None)
 
 
-def faces(rows: np.ndarray, **changes: Any) -> EmbeddedSet:
-    return EmbeddedSet(
-        **{"pairs": verification_set(), "embeddings": made_trials().embeddings, "rows": rows}
-        | {"failures": ()}
-        | changes
-    )
-
-
 def test_rows_are_means_of_their_runs() -> None:
-    trials = made_trials()
-    results = document(
-        PLAN,
-        Model(N, {}),
-        [],
-        run(),
-        [SetResult(faces(np.arange(60)), trials, (), None)],
-        None,
-        options={},
-    )
-    json.dumps(results, allow_nan=False)
+    results = made_results()
     rows, runs = results["rows"], results["runs"]
-    # raw by two searches; 2 strategies x 2 dims x 2 modes x 2 metrics.
-    assert len(rows) == 2 + 2 * 2 * 2 * 2
+    # raw and raw+flip by two searches; random, and two strategies with pool and with generator, in
+    # 2 dims x 2 modes x 2 metrics.
+    assert len(rows) == 2 * 2 + (1 + 2 * 2) * 2 * 2 * 2
     for row in rows:
         own = [each for each in runs if all(each[key] == row[key] for key in ROW)]
         sides = 2 if row["mode"] == "p2s" else 1
-        assert len(own) == row["runs"] == (1 if row["strategy"] == "raw" else 2 * sides)
+        assert len(own) == row["runs"] == (2 * sides if row["dim"] else 1)
         means = [np.mean(each["accuracies"]) for each in own]
         assert row["accuracy_mean"] == pytest.approx(np.mean(means))
         assert row["accuracy_std"] == pytest.approx(
@@ -110,8 +74,8 @@ def test_rows_are_means_of_their_runs() -> None:
         assert at["ci_low"] <= at["value"] <= at["ci_high"]
         assert at["fmr"] <= 0.1
         assert "0.0001" not in row["fnmr_at_fmr"]
-    assert "made: FMR 0.0001 is not reported" in results["refused"][0]
-    assert len(results["curves"]) == len(rows) - 1
+    assert "lfw: FMR 0.0001 is not reported" in results["refused"][0]
+    assert len(results["curves"]) == len(rows) - 2
 
 
 def test_a_set_without_folds_has_every_figure_but_the_accuracy() -> None:
@@ -137,7 +101,7 @@ def test_pairs_without_an_embedding_are_counted() -> None:
     rows = np.arange(60)
     rows[lost] = -1
     rows[rows > lost] -= 1
-    acquired = faces(
+    acquired = made_faces(
         rows,
         embeddings=np.delete(made_trials().embeddings, lost, axis=0),
         failures=(Failure(Path(pairs.pictures[lost].name), "no_face", "No face was found."),),
@@ -157,18 +121,18 @@ def test_pairs_without_an_embedding_are_counted() -> None:
         known.people[0], [numbers[f"p{i // 2}"] for i in pairs.first[~touched]]
     )
     with pytest.raises(DatasetError, match="without the 100 pairs that lack an embedding"):
-        trials_of(faces(np.full(60, -1)), attributes=None, sources=())
+        trials_of(made_faces(np.full(60, -1)), attributes=None, sources=())
 
 
 def test_a_template_is_the_mean_of_its_photos_that_were_acquired() -> None:
     rows = np.arange(60)
     rows[[2, 5, 6]] = -1
-    found = averaged(faces(rows), [(0, 1), (2, 3), (4,), (5, 6)])
-    np.testing.assert_array_equal(found.rows, [0, 1, 2, -1])
+    means = averaged(made_faces(rows), [(0, 1), (2, 3), (4,), (5, 6)])
+    np.testing.assert_array_equal(means.rows, [0, 1, 2, -1])
     photos = made_trials().embeddings.astype(float)
     mean = photos[0] + photos[1]
-    np.testing.assert_allclose(found.embeddings[0], mean / np.linalg.norm(mean), atol=1e-6)
-    np.testing.assert_allclose(found.embeddings[1:], photos[[3, 4]], atol=1e-6)
+    np.testing.assert_allclose(means.embeddings[0], mean / np.linalg.norm(mean), atol=1e-6)
+    np.testing.assert_allclose(means.embeddings[1:], photos[[3, 4]], atol=1e-6)
 
 
 def test_rates_with_failures_follow_the_standard() -> None:
@@ -197,8 +161,8 @@ def test_rates_with_failures_follow_the_standard() -> None:
 def test_the_collision_floor(strategy: str, dim: int, entries: int, expected: float | None) -> None:
     source = pool(entries, labelled=True)
     names = {"strategy": strategy, "shared_decoys": True, "dim": dim}
-    found = collision_floor(names, source)
-    assert found == (None if expected is None else pytest.approx(expected))
+    floor = collision_floor(names, source)
+    assert floor == (None if expected is None else pytest.approx(expected))
     assert collision_floor(names | {"shared_decoys": False}, source) == 0
 
 

@@ -2,13 +2,14 @@
 
 import csv
 import re
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from tests.verify.evaluation.sample_results import sample_results
+from tests.verify.evaluation.made_results import made_results, row_of
 from verify.evaluation import markdown_cells as cells
 from verify.evaluation.groups import by_group
 from verify.evaluation.tables import markdown, write_csv
@@ -28,22 +29,17 @@ def table_of(report: str, *, place: int = 0) -> list[dict[str, str]]:
     return [dict(zip(titles, line, strict=True)) for line in lines]
 
 
-def find(results: dict[str, Any], **keys: Any) -> dict[str, Any]:
-    (row,) = (r for r in results["rows"] if all(r[k] == v for k, v in keys.items()))
-    return row
-
-
 def test_the_csv_has_each_row_with_its_numbers_in_full(tmp_path: Path) -> None:
-    results = sample_results(shared=(False, True))
+    results = made_results()
     write_csv(results["rows"], tmp_path / "r.csv")
     lines = read(tmp_path / "r.csv")
     assert (tmp_path / "r.csv").read_bytes().split(b"\r\n")[0].startswith(b"dataset,strategy,")
     for line, row in zip(lines, results["rows"], strict=True):
         assert float(line["accuracy_mean"]) == row["accuracy_mean"]
-        rate = row["fnmr_at_fmr"]["0.001"]
-        assert float(line["fnmr_at_fmr_0.001"]) == rate["value"]
-        assert float(line["fnmr_at_fmr_0.001_ci_low"]) == rate["ci_low"]
-        assert line["fnmr_at_fmr_0.001_interval"] == "subject-bootstrap"
+        rate = row["fnmr_at_fmr"]["0.1"]
+        assert float(line["fnmr_at_fmr_0.1"]) == rate["value"]
+        assert float(line["fnmr_at_fmr_0.1_ci_low"]) == rate["ci_low"]
+        assert line["fnmr_at_fmr_0.1_interval"] == "subject-bootstrap"
         assert [float(line[f"thresholds_{i}"]) for i in range(1, 11)] == row["thresholds"]
         assert line["decoys"] == (row["decoys"] or "")
         spelled = {None: "", True: "true", False: "false"}
@@ -56,7 +52,7 @@ def test_the_csv_has_each_row_with_its_numbers_in_full(tmp_path: Path) -> None:
     + [('my "set", of\nfaces', 'my "set", of\nfaces')],
 )
 def test_the_csv_holds_no_formula(tmp_path: Path, text: str, written: str) -> None:
-    results = sample_results(dims=(2,))
+    results = made_results()
     for row in results["rows"]:
         row |= {"dataset": text, "d_prime": -0.25, "thresholds": [-0.5, -1e-9]}
     write_csv(results["rows"], tmp_path / "r.csv")
@@ -67,8 +63,9 @@ def test_the_csv_holds_no_formula(tmp_path: Path, text: str, written: str) -> No
 
 
 def test_a_line_of_the_report_says_what_its_row_says() -> None:
-    results = sample_results(dims=(16,), shared=(True,), liftings=(("adversarial", "pool"),))
-    row = find(results, mode="s2s", metric="spherical")
+    results = made_results()
+    keys = {"strategy": "adversarial", "decoys": "pool", "dim": 3, "metric": "spherical"}
+    row = row_of(results, mode="s2s", **keys)
     row |= {"accuracy_mean": 0.93854, "accuracy_std": 0.0121, "accuracy_std_seeds": 0.0031}
     row |= {"eer": 0.0612, "auc": 0.981234, "d_prime": -3.456, "template_bytes": 17700}
     row |= {"collision_floor": 0.0512, "collisions_mean": 153.4}
@@ -76,7 +73,7 @@ def test_a_line_of_the_report_says_what_its_row_says() -> None:
         "0.01": {"value": 0.0653, "ci_low": 0.0571, "ci_high": 0.0747, "interval": "pair-bootstrap"}
         | {"trials": 3000, "errors_mean": 195.9},
     }
-    other = find(results, mode="p2s", metric="spherical")
+    other = row_of(results, mode="p2s", **keys)
     other |= {"accuracy_mean": None, "eer": None, "auc": None, "d_prime": None, "fnmr_at_fmr": {}}
     report = markdown(results)
     lines = table_of(report)
@@ -84,21 +81,26 @@ def test_a_line_of_the_report_says_what_its_row_says() -> None:
     assert "raw (grid)" in {line["strategy"] for line in lines}
     assert "Intervals: bootstrap by subject." in report
     assert "Intervals: bootstrap of pairs." in report
-    shown = {line["matching"]: line for line in lines if line["metric"] == "spherical"}
+    shown = {
+        line["matching"]: line
+        for line in lines
+        if (line["strategy"], line["m"]) == ("adversarial (pool, shared)", "3")
+        and line["metric"] == "spherical"
+    }
     assert shown["s-to-s"] == {
         "strategy": "adversarial (pool, shared)",
-        "m": "16",
+        "m": "3",
         "matching": "s-to-s",
         "metric": "spherical",
         "accuracy %": "93.85 ± 1.21 (± 0.31)",
         "EER %": "6.12",
+        "FNMR % at FMR 1e-1": "-",
         "FNMR % at FMR 1e-2": "6.53 [5.71, 7.47] (195.9/3000)",
-        "FNMR % at FMR 1e-3": "-",
         "AUC": "0.98123",
         "d'": "-3.46",
         "collision floor %": "5.12",
         "collisions": "153.4",
-        "runs": "3",
+        "runs": "2",
         "template bytes": "17,700",
     }
     assert list(shown["p-to-s"].values())[4:12] == ["-"] * 8
@@ -110,37 +112,45 @@ def test_the_spread_over_seeds_is_shown_where_there_are_two() -> None:
 
 
 def test_the_report_says_where_its_numbers_come_from() -> None:
-    results = sample_results(dims=(2,), datasets=("lfw", "cfp_fp"))
-    results["datasets"][1]["decoys"] = [
-        {"kind": "pool", "source_id": "f" * 64, "entries": 4000, "left_out": 1000},
+    results = made_results()
+    other = results["datasets"][0] | {"name": "cfp_fp", "failures": [], "notes": ["it is odd"]}
+    other["decoys"] = [
+        {"kind": "pool", "source_id": "f" * 64, "entries": 4000, "left_out": 0},
         {"kind": "generator", "source_id": "0" * 64, "entries": None, "left_out": 0},
     ]
+    results["datasets"].append(other)
+    results["rows"] += [row | {"dataset": "cfp_fp"} for row in results["rows"]]
     report = markdown(results)
     assert report == markdown(results)
     assert not re.search(r"\b20\d\d-\d\d", report)
     head, lfw, cfp = re.split(r"(?m)^## (?:lfw|cfp_fp)$", report)
-    assert "- Embeddings: made_up, n = 512, SHA-256 `abababababab`\n" in head
-    assert "- Decoys: `pool.veil`, pool of 5,000 entries, labelled, SHA-256 `cdcd" in head
-    assert "- Seeds: 0, 1, 2\n" in head
-    assert "veilface 0.0.0, python 3.11.9, numpy 2.2.0" in head
-    assert "7,701 photos, 4,281 people, aligned crops; 3,000 genuine and 3,000 impostor" in lfw
-    said = "left out that resemble people of this set"
-    assert f"Decoys used: pool of 4,997 entries, source `made up`; 3 {said}" in lfw
-    assert f"pool of 4,000 entries, source `ffffffffffff`; 1,000 {said}" in cfp
+    assert "- Embeddings: made_up, n = 24, SHA-256 `abababababab`\n" in head
+    assert "- Decoys: `pool.veil`, pool of 120 entries, labelled, SHA-256 `cdcdcdcdcdcd`" in head
+    assert "- Seeds: 0, 1\n" in head
+    assert f"- Software: veilface {version('veilface')}, python 3." in head
+    assert (
+        "60 photos, 30 people, aligned crops; 50 genuine and 50 impostor comparisons of 100" in lfw
+    )
+    assert "SHA-256: photos `121212121212`, `pairs.txt` `343434343434`" in lfw
+    assert "; 3 left out that resemble people of this set" in lfw
+    assert "Decoys used: pool of 4,000 entries, source `ffffffffffff`\n" in cfp
     assert "Decoys used: generator, source `000000000000`\n" in cfp
-    assert "- FMR 1e-4 on lfw: 3,000 impostor pairs resolve 1e-3." in cfp
+    assert "Note: it is odd" in cfp
+    assert "- lfw: FMR 0.0001 is not reported." in cfp
 
 
 def test_failures_to_acquire_are_listed_up_to_twenty_and_cannot_break_the_report() -> None:
-    results = sample_results(dims=(2,), failures=23)
-    results["datasets"][0]["failures"][0] |= {"image": "a`|\n# b<script>", "reason": "x |\r\ny"}
+    results = made_results()
+    assert "Failures to acquire: none." in markdown(results)
+    named = [{"image": f"Nobody_{i}", "code": "no_face", "reason": "-"} for i in range(22)]
+    foreign = {"image": "a`|\n# b<script>", "code": "no_face", "reason": "x |\r\ny"}
+    results["datasets"][0] |= {"failures": [foreign, *named], "fta": 0.003, "failed_genuine": 23}
     report = markdown(results)
     assert report.count("- `Nobody_") == 19
     assert "- `a'| # b<script>`: no_face, x &#124; y" in report
     assert "\n# b" not in report
     assert "- and 3 more" in report
     assert "Failures to acquire: 23 photos (FTA 0.30 %); 23 genuine and 0 impostor" in report
-    assert "Failures to acquire: none." in markdown(sample_results(dims=(2,), failures=0))
 
 
 def test_the_worst_group_is_named_with_its_counts() -> None:
@@ -155,14 +165,15 @@ def test_the_worst_group_is_named_with_its_counts() -> None:
     groups, summary = by_group(
         [similarities], same, labels, labels, attribute="gender", thresholds=[0.5], target_fmr=0.01
     )
-    results = sample_results(dims=(2,))
-    row = find(results, strategy="hybrid", mode="s2s", metric="spherical")
+    results = made_results()
+    keys = {"strategy": "hybrid", "decoys": "generator", "dim": 2}
+    row = row_of(results, mode="s2s", metric="spherical", **keys)
     names = ("dataset", "strategy", "decoys", "shared_decoys", "dim", "mode", "metric")
     head = {name: row[name] for name in names} | {"seed": 0}
     results["groups"] = [head | entry for entry in groups]
     results["group_summaries"] = [head | summary]
     (line,) = table_of(markdown(results), place=1)
-    assert (line["strategy"], line["matching"]) == ("hybrid (pool)", "s-to-s")
+    assert (line["strategy"], line["matching"]) == ("hybrid (generator)", "s-to-s")
     for title, start, counts in (
         ("worst FMR %", "Male: 4.00 [", "(20/500)"),
         ("worst FNMR %", "Female: 6.00 [", "(30/500)"),
