@@ -13,8 +13,7 @@ from templates.decoys import DecoySource
 from templates.keys.randomness import KEY_BYTES, Keystream
 from templates.keys.rotation import TenantRotation
 from templates.space.agreement import InconsistentImages
-from verify.evaluation.liveness.scores import ScoredSet
-from verify.evaluation.liveness.verified import VerifiedSet
+from verify.evaluation.liveness.scores import ScoredSet, VerifiedSet
 from verify.verifier import Verifier
 
 ENROLLED_PHOTOS = 3

@@ -27,8 +27,7 @@ from verify.evaluation.liveness.document import (
 )
 from verify.evaluation.liveness.presentations import PresentationSet, read_presentations
 from verify.evaluation.liveness.rates import threshold_at_bpcer
-from verify.evaluation.liveness.scores import ScoredSet, score_set
-from verify.evaluation.liveness.verified import VerifiedSet
+from verify.evaluation.liveness.scores import ScoredSet, VerifiedSet, score_set
 from verify.evaluation.plan import Json
 from verify.evaluation.provenance import Model
 from verify.preparation import recorded_of
@@ -166,8 +165,8 @@ def require_responses(scored: ScoredSet) -> None:
     CommandError
         No live photo, or no attack photo, gave a score.
     """
-    attacks = [len(scored.scored(name)[0]) for name in scored.presented.species]
-    if not len(scored.scored(None)[0]) or not any(attacks):
+    attacks = [len(scored.scored(name)) for name in scored.presented.species]
+    if not len(scored.scored(None)) or not any(attacks):
         raise CommandError(
             "a face was found in no live photo, or in no attack photo: are these whole frames with "
             "a face in them?"
@@ -186,7 +185,7 @@ def _points(
         )
     for target in sorted(set(targets)):
         try:
-            threshold = threshold_at_bpcer(scored.scored(None)[0], target)
+            threshold = threshold_at_bpcer(scored.scored(None), target)
         except DatasetError as error:
             refused.append(str(error))
         else:

@@ -10,8 +10,7 @@ from models.liveness import PassiveLiveness
 from templates.contract.document import Contract
 from templates.contract.levels import Rate
 from verify.evaluation.liveness.rates import apcer, bpcer, non_response
-from verify.evaluation.liveness.scores import ScoredSet
-from verify.evaluation.liveness.verified import VerifiedSet
+from verify.evaluation.liveness.scores import ScoredSet, VerifiedSet
 from verify.evaluation.markdown_cells import (
     code,
     count,
@@ -62,8 +61,8 @@ def document(
         Why operating points that were asked for are not there.
     """
     presented = scored.presented
-    species = [name for name in presented.species if len(scored.scored(name)[0])]
-    live = scored.scored(None)[0]
+    species = [name for name in presented.species if len(scored.scored(name))]
+    live = scored.scored(None)
     verification: Json = {"measured": False, "reason": unverified}
     if verified is not None:
         verification = {
@@ -96,10 +95,10 @@ def document(
             for failure in scored.failures
         ],
         "rows": [row for point in points for row in _rows(scored, species, point, verified)],
-        "eer": {name: equal_error_rate(live, scored.scored(name)[0])[0] for name in species},
+        "eer": {name: equal_error_rate(live, scored.scored(name))[0] for name in species},
         "verification": verification,
         "refused": list(refused),
-        "curves": [_curve(live, scored.scored(name)[0], name) for name in species],
+        "curves": [_curve(live, scored.scored(name), name) for name in species],
     }
 
 

@@ -9,16 +9,13 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from templates.contract.levels import Rate
 from templates.contract.liveness import LivenessCalibration
 from verify.datasets import DatasetError
 from verify.evaluation.liveness.scores import ScoredSet
-from verify.metrics import RULE_OF_THREE, rate, resolvable, subject_bootstrap, threshold_at_fmr
-
-LEAST_PEOPLE = 5
-"""Fewer say nothing by being resampled."""
+from verify.metrics import RULE_OF_THREE, resolvable, threshold_at_fmr
 
 
 def threshold_at_bpcer(live: ArrayLike, target: float) -> float:
@@ -41,43 +38,19 @@ def threshold_at_bpcer(live: ArrayLike, target: float) -> float:
     return -threshold_at_fmr(-scores, target)
 
 
-def share(errors: NDArray[np.bool_], subjects: Sequence[str | None]) -> Rate:
-    """Rate of errors; its interval resamples people where they are known, as photos share them.
-
-    Parameters
-    ----------
-    errors : (k,) bool
-    """
-    people, codes = np.unique([name or "" for name in subjects], return_inverse=True)
-    if None in subjects or len(people) < LEAST_PEOPLE:
-        return rate(int(np.count_nonzero(errors)), len(errors))
-    photos = np.bincount(codes, minlength=len(people)).astype(np.float64)
-    wrong = codes[errors]
-    return subject_bootstrap(
-        np.stack([wrong, wrong], axis=1),
-        people=len(people),
-        trials=len(errors),
-        weighted_trials=lambda weights: float(weights @ photos),
-    )
-
-
 def bpcer(scored: ScoredSet, threshold: float) -> Rate:
     """Share of the live photos with a face that are taken for attacks."""
-    scores, subjects = scored.scored(None)
-    return share(scores < threshold, subjects)
+    return scored.rate(None, scored.scores < threshold, among=scored.acquired)
 
 
 def apcer(scored: ScoredSet, species: str, threshold: float) -> Rate:
     """Share of the attack photos of one species with a face that are taken for live."""
-    scores, subjects = scored.scored(species)
-    return share(scores >= threshold, subjects)
+    return scored.rate(species, scored.scores >= threshold, among=scored.acquired)
 
 
 def non_response(scored: ScoredSet, species: str | None) -> Rate:
     """Share of the photos of one species (APNRR), or of the live ones (BPNRR), without a face."""
-    rows = scored.rows(species)
-    failed = ~scored.acquired[rows]
-    return share(failed, [scored.presentations[row].subject for row in rows])
+    return scored.rate(species, ~scored.acquired, among=np.ones_like(scored.acquired))
 
 
 def calibrate_liveness(
@@ -90,7 +63,7 @@ def calibrate_liveness(
     DatasetError
         Where the live photos cannot resolve the target.
     """
-    threshold = threshold_at_bpcer(scored.scored(None)[0], target)
+    threshold = threshold_at_bpcer(scored.scored(None), target)
     return LivenessCalibration(
         graphs=tuple(graphs),
         threshold=threshold,
@@ -99,7 +72,7 @@ def calibrate_liveness(
         apcer={
             name: apcer(scored, name, threshold)
             for name in scored.presented.species
-            if len(scored.scored(name)[0])
+            if len(scored.scored(name))
         },
         calibrated_on=_counts(scored),
     )

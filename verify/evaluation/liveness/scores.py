@@ -12,9 +12,35 @@ from models.extraction import Failure
 from models.faces import FaceSample
 from models.pack import ModelPack
 from models.sessions import default_workers
+from templates.contract.levels import Rate
 from verify.evaluation.liveness.presentations import Presentation, PresentationSet
+from verify.metrics import rate, subject_bootstrap
 
 Array64 = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+LEAST_PEOPLE = 5
+"""Fewer say nothing by being resampled."""
+
+
+def share(errors: Flags, subjects: Sequence[str | None]) -> Rate:
+    """Rate of errors; its interval resamples people where they are known, as photos share them.
+
+    Parameters
+    ----------
+    errors : (k,) bool
+    """
+    people, codes = np.unique([name or "" for name in subjects], return_inverse=True)
+    if None in subjects or len(people) < LEAST_PEOPLE:
+        return rate(int(np.count_nonzero(errors)), len(errors))
+    photos = np.bincount(codes, minlength=len(people)).astype(np.float64)
+    wrong = codes[errors]
+    return subject_bootstrap(
+        np.stack([wrong, wrong], axis=1),
+        people=len(people),
+        trials=len(errors),
+        weighted_trials=lambda weights: float(weights @ photos),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +66,7 @@ class ScoredSet:
         return self.presented.presentations
 
     @property
-    def acquired(self) -> NDArray[np.bool_]:
+    def acquired(self) -> Flags:
         """Whether a face was found, (k,)."""
         return np.isfinite(self.scores)
 
@@ -48,10 +74,53 @@ class ScoredSet:
         """Places of the presentations of one species, or of the live ones, without a face too."""
         return np.flatnonzero([one.species == species for one in self.presentations])
 
-    def scored(self, species: str | None) -> tuple[Array64, list[str | None]]:
-        """Scores of one species, or of the live ones, and whose faces they are."""
-        rows = [row for row in self.rows(species) if self.acquired[row]]
-        return self.scores[rows], [self.presentations[row].subject for row in rows]
+    def scored(self, species: str | None) -> Array64:
+        """Scores of one species, or of the live ones."""
+        scores = self.scores[self.rows(species)]
+        return scores[np.isfinite(scores)]
+
+    def rate(self, species: str | None, wrong: Flags, *, among: Flags) -> Rate:
+        """Share of one species that went wrong, among those that are asked about; both (k,)."""
+        rows = [row for row in self.rows(species) if among[row]]
+        return share(wrong[rows], [self.presentations[row].subject for row in rows])
+
+
+@dataclass(frozen=True, eq=False)
+class VerifiedSet:
+    """Decisions on photos whose subject is enrolled, each against that subject's template.
+
+    Parameters
+    ----------
+    matched, tried : (k,) bool
+        Whether a photo was accepted, and whether it was shown at all: photos of people who are
+        not enrolled, and those that people were enrolled by, are not. One without a face is
+        shown, and not accepted.
+    left_out
+        Subjects who were not enrolled: too few live photos with a face, or they do not agree.
+    """
+
+    scored: ScoredSet
+    matched: Flags = field(repr=False)
+    tried: Flags = field(repr=False)
+    level: str
+    target_fmr: float | None
+    enrolled_photos: int
+    enrolled: int
+    left_out: tuple[str, ...]
+
+    def accepted(self, threshold: float | None) -> Flags:
+        """Whether the whole verification accepts, (k,); by the comparison alone where None."""
+        if threshold is None:
+            return self.matched
+        return self.matched & (self.scored.scores >= threshold)
+
+    def iapmr(self, species: str, threshold: float | None) -> Rate:
+        """Share of the attacks of one species on their own subject's template that succeed."""
+        return self.scored.rate(species, self.accepted(threshold), among=self.tried)
+
+    def false_rejections(self, threshold: float | None) -> Rate:
+        """Share of the live photos that are rejected, by the comparison or as an attack."""
+        return self.scored.rate(None, ~self.accepted(threshold), among=self.tried)
 
 
 def score_set(

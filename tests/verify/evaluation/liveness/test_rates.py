@@ -12,10 +12,9 @@ from verify.evaluation.liveness.rates import (
     bpcer,
     calibrate_liveness,
     non_response,
-    share,
     threshold_at_bpcer,
 )
-from verify.evaluation.liveness.verified import VerifiedSet
+from verify.evaluation.liveness.scores import VerifiedSet, share
 from verify.metrics import wilson
 
 STATED = [
