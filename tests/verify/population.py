@@ -11,16 +11,13 @@ from templates.keys.randomness import Keystream
 from templates.keys.rotation import ROTATION_VERSION
 from templates.space.lifting import Strategy, lift
 from templates.space.subspace import SubspaceBatch
+from tests.verify.synthetic import unit
 from verify import CalibrationOptions, calibrate
 
 N, K, M = 64, 56, 8
 PHOTOS = 3
 PEOPLE = 400
 Floats = NDArray[np.float32]
-
-
-def unit(rows: NDArray[np.floating]) -> Floats:
-    return (rows / np.linalg.norm(rows, axis=-1, keepdims=True)).astype(np.float32)
 
 
 def photos_of(people: int, photos: int, *, seed: int) -> Floats:

@@ -10,6 +10,7 @@ from templates.contract.document import Binding
 from templates.decoys import DecoyGenerator, DecoyPool
 from templates.keys.rotation import ROTATION_VERSION, TenantRotation
 from templates.space.lifting import Strategy
+from templates.space.subspace import SubspaceBatch
 from verify import Calibrated, CalibrationOptions, calibrate
 
 N = 64
@@ -114,3 +115,9 @@ def embeddings_of(points: NDArray[np.floating]) -> NDArray[np.float32]:
 def projected(descriptor: NDArray[np.float32]) -> NDArray[np.float32]:
     """Coordinates (K,) of one embedding."""
     return make_generator().project(descriptor[None])[0]
+
+
+def spherical(probe: NDArray[np.floating], template: SubspaceBatch) -> float:
+    """Similarity of docs/method.md §3.4 in float64: e·p + s‖D e‖."""
+    e, p, d = (part.astype(np.float64) for part in (probe, template.foot, template.basis))
+    return float(e @ p + np.sqrt(1 - p @ p) * np.linalg.norm(d @ e))

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from enroll import Enroller
 from templates.contract.document import Contract
@@ -23,6 +22,7 @@ from tests.verify.synthetic import (
     make_binding,
     make_generator,
     make_pool,
+    spherical,
     tenant_rotation,
 )
 from verify import Calibrated, CalibrationOptions, Verifier, calibrate
@@ -30,14 +30,6 @@ from verify.calibration_mode import ACCURACY_LEVEL
 from verify.comparisons import Lifter, honest_norms, point_trials
 from verify.tenfold import Pair
 from verify.trials import enrolled_means, plan_trials, probe_sets
-
-
-def spherical(
-    probe: NDArray[np.floating], foot: NDArray[np.floating], basis: NDArray[np.floating]
-) -> float:
-    """Similarity of docs/method.md §3.4 in float64: e·p + s‖D e‖."""
-    e, p, d = (array.astype(np.float64) for array in (probe, foot, basis))
-    return float(e @ p + np.sqrt(1 - p @ p) * np.linalg.norm(d @ e))
 
 
 @pytest.mark.parametrize("most_templates", [None, 9])
@@ -69,7 +61,7 @@ def test_point_trials_agree_with_brute_force(most_templates: int | None) -> None
 
     def score(photo: int, person: int) -> float:
         template = templates[compared.index(person)]
-        close = spherical(points[photo], template.foot, template.basis)
+        close = spherical(points[photo], template)
         return float((close - means[photo]) / spreads[photo])
 
     photos = np.concatenate(

@@ -21,6 +21,7 @@ from tests.verify.synthetic import (
     embeddings_of,
     make_generator,
     projected,
+    spherical,
     tenant_rotation,
     unit,
 )
@@ -80,12 +81,6 @@ def without_both(enrollment: Enrollment, key: bytes) -> SubspaceBatch:
     assert enrollment.holder_salt is not None
     rotation = holder_rotation(key, enrollment.holder_salt, K)
     return without_tenant(enrollment).turned_by(rotation.turned_back)
-
-
-def spherical(probe: NDArray[np.floating], template: SubspaceBatch) -> float:
-    foot, basis = template.foot.astype(np.float64), template.basis.astype(np.float64)
-    e = probe.astype(np.float64)
-    return float(e @ foot + np.sqrt(1 - foot @ foot) * np.linalg.norm(basis @ e))
 
 
 def test_the_tenants_key_alone_does_not_turn_a_template_back(keyed: Enrollment) -> None:

@@ -26,6 +26,7 @@ from tests.verify.synthetic import (
     embeddings_of,
     make_generator,
     projected,
+    spherical,
     tenant_rotation,
     unit,
 )
@@ -77,12 +78,6 @@ def nobody(contract: Contract) -> StandIn:
     with Keystream.seeded("nobody") as stream:
         template = contract.nobody(make_generator()).lift(stream)
     return StandIn(wire.encode(template, contract_id=contract.contract_id, dtype="float16"))
-
-
-def spherical(probe: NDArray[np.floating], template: SubspaceBatch) -> float:
-    foot, basis = template.foot.astype(np.float64), template.basis.astype(np.float64)
-    e = probe.astype(np.float64)
-    return float(e @ foot + np.sqrt(1 - foot @ foot) * np.linalg.norm(basis @ e))
 
 
 @pytest.mark.parametrize("person", [0, 1])

@@ -3,14 +3,11 @@
 import numpy as np
 
 from templates.decoys import Attributes, DecoyPool
+from tests.verify.synthetic import unit
 from verify.evaluation.comparison import Trials
 from verify.evaluation.verification_set import contiguous_folds
 
 N = 24
-
-
-def unit(rows: np.ndarray) -> np.ndarray:
-    return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
 
 
 def pool(entries: int = 120, *, n: int = N, labelled: bool = False, seed: int = 0) -> DecoyPool:
