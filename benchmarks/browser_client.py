@@ -291,8 +291,8 @@ def planted_and_missed(opened: Visit, photo: Path, search: LeakSearch) -> list[s
     for planted, (kind, form) in PLANTED.items():
         opened.application.recording.forget()
         opened.call("plant", planted, name)
-        found = search.find(opened.application.recording.sent)
-        if not any(leak.what == f"{kind} {name}" and leak.form.startswith(form) for leak in found):
+        leaks = search.find(opened.application.recording.sent)
+        if not any(leak.what == f"{kind} {name}" and leak.form.startswith(form) for leak in leaks):
             missed.append(planted)
     return missed
 
@@ -374,14 +374,14 @@ def measure(args: argparse.Namespace) -> list[dict[str, object]]:
         camera.shows(there[0].probes[0])
         looked, page_bytes = first_look(context, recording.url, key, there[0].name)
         looked.page.close()
-        again, page_bytes_again = first_look(context, recording.url, key, there[0].name)
-        by_page = by_the_shutter(again, camera, there, level=level)
+        second, page_bytes_again = first_look(context, recording.url, key, there[0].name)
+        by_page = by_the_shutter(second, camera, there, level=level)
         sent = served.recording.sent + recording.sent
         calls, rest = requests_in(sent)
         search = faces_of(pack, people, shown)
         leaks = search.find(sent)
         missed = planted_and_missed(opened, people[0].probes[0], search)
-        tabs = [first.tab, opened.tab, looked, again]
+        tabs = [first.tab, opened.tab, looked, second]
         complaints = [complaint for tab in tabs for complaint in tab.complaints]
         complaints += [*opened.tab.violations(), *again.violations()]
         # Each tab has noted every request of the browser.

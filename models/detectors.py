@@ -106,7 +106,7 @@ class YuNet(Detector):
         size = self.canvas(image, size)
         canvas, scale = letterbox(image, size, enlarge=False)
         blob = channels_first(canvas, (2, 1, 0))
-        named = dict(
+        outputs = dict(
             zip(
                 YUNET_OUTPUTS,
                 self._session.run({self._input_name: blob}, YUNET_OUTPUTS),
@@ -116,19 +116,19 @@ class YuNet(Detector):
         boxes, scores, keypoints = [], [], []
         for stride in STRIDES:
             rows, columns = size[0] // stride, size[1] // stride
-            cls = named[f"cls_{stride}"].reshape(-1)
+            cls = outputs[f"cls_{stride}"].reshape(-1)
             if len(cls) != rows * columns:
                 raise self._misfit(stride, size)
-            obj = named[f"obj_{stride}"].reshape(-1)
+            obj = outputs[f"obj_{stride}"].reshape(-1)
             score = np.sqrt(np.clip(cls, 0, 1) * np.clip(obj, 0, 1))
             cells = np.flatnonzero(score >= self.score_threshold)
             corner = cell_corners(cells, columns, stride=stride)
-            box = named[f"bbox_{stride}"].reshape(-1, 4)[cells]
+            box = outputs[f"bbox_{stride}"].reshape(-1, 4)[cells]
             centre = corner + box[:, :2] * stride
             half = np.exp(np.minimum(box[:, 2:], _MAX_LOG_SIDE)) * (stride / 2)
             boxes.append(np.concatenate([centre - half, centre + half], axis=1))
             scores.append(score[cells])
-            points = named[f"kps_{stride}"].reshape(-1, 5, 2)[cells]
+            points = outputs[f"kps_{stride}"].reshape(-1, 5, 2)[cells]
             keypoints.append(corner[:, None, :] + points * stride)
         return faces_from_candidates(boxes, scores, keypoints, overlap=_YUNET_OVERLAP, scale=scale)
 

@@ -163,9 +163,9 @@ class PassiveLiveness:
     def __init__(self, graphs: Sequence[LivenessGraph]) -> None:
         kinds = {graph.expects.score for graph in graphs}
         if len(kinds) != 1:
-            named = ", ".join(f"{graph.file} ({graph.expects.score})" for graph in graphs)
+            names = ", ".join(f"{graph.file} ({graph.expects.score})" for graph in graphs)
             raise ModelError(
-                f"The liveness graphs score in different units: {named}. State one score for all"
+                f"The liveness graphs score in different units: {names}. State one score for all"
                 " of them in pack.toml, or leave one kind in the folder."
             )
         self.members = tuple(graphs)

@@ -201,10 +201,10 @@ def chosen_photos(
     names
         Their people.
     """
-    named = [aliases.get(name, name) for name in identities]
+    people = [aliases.get(name, name) for name in identities]
     gone = {aliases.get(name, name) for name in exclude}
-    photos = [index for index, name in enumerate(named) if name not in gone]
-    return np.asarray(photos, dtype=np.int64), [named[index] for index in photos]
+    photos = [index for index, name in enumerate(people) if name not in gone]
+    return np.asarray(photos, dtype=np.int64), [people[index] for index in photos]
 
 
 def impostor_groups(

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -27,10 +28,8 @@ from verify.evaluation.row_labels import (
     strategy_label,
 )
 
-CHANCE = 50.0
 PAIR_INCHES, LABEL_PAIRS = 0.25, 4
 PANEL_INCHES, HEADER_INCHES, SIDE_INCHES, NARROWEST_INCHES = 2.75, 0.42, 1.3, 7.0
-FLOORS = (99.0, 98.0, 97.0, 96.0, 95.0, 94.0, 92.0, 90.0, 85.0, 80.0, 75.0, 70.0, 60.0, CHANCE, 0.0)
 MODE_TITLES = {"p2s": "point to subspace", "s2s": "subspace to subspace"}
 LOOKS: dict[str, dict[str, Any]] = {
     "euclidean": {"facecolor": "#fde9c8", "edgecolor": "#7a4a00", "hatch": "/////"},
@@ -136,8 +135,8 @@ def _raw_line(axes: Axes, raw: Row | None) -> None:
 
 def _floor(rows: Sequence[Row]) -> float:
     """Return where the vertical axis starts: a twentieth of its height below the lowest foot."""
-    feet = [100 * (r["accuracy_mean"] - r["accuracy_std"]) for r in rows if r["accuracy_mean"]]
-    return next(floor for floor in FLOORS if min(feet) >= floor + (100 - floor) / 20 or floor == 0)
+    foot = min(100 * (r["accuracy_mean"] - r["accuracy_std"]) for r in rows if r["accuracy_mean"])
+    return max(0.0, float(np.floor(foot - (100 - foot) / 20)))
 
 
 def _dress(axes: Axes, places: Mapping[tuple[str, int], float], floor: float, title: str) -> None:

@@ -1,13 +1,12 @@
 """DET curves: one error rate over the other on normal-deviate axes, with bands of uncertainty."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from scipy.special import ndtr, ndtri
 
 from verify.evaluation.figures.style import (
@@ -17,9 +16,9 @@ from verify.evaluation.figures.style import (
     MARKERS,
     QUIET,
     RULE,
+    SMALL_SIZE,
     house_style,
     panels,
-    side_legend,
 )
 from verify.evaluation.row_labels import (
     LIFTED_MODES,
@@ -38,16 +37,15 @@ RATE_TICKS = (1e-6, 1e-5, 1e-4, 1e-3, 0.01, 0.05, 0.2, 0.5, 0.8, 0.95, 0.99, 0.9
 SMALLEST = 1e-7
 BAND_ALPHA = 0.11
 PANEL_INCHES = (4.6, 4.3)
-SIDE_INCHES = 2.75
-EQUAL: Look = {"color": QUIET, "linewidth": 0.9}
+SIDE_INCHES = 3.1
 
 
 def det_figure(results: Mapping[str, Any]) -> Figure | None:
     """Draw FNMR over FMR; None where no lifted or raw curve is there.
 
     One panel for each data set and mode. The metric is spherical where it was run, and of the
-    dimensions the smallest and the largest that all strategies of the panel have; raw embeddings
-    are in every panel as a reference. Bands are 95 %.
+    dimensions the smallest (dashed) and the largest that all strategies of the panel have; raw
+    embeddings are in every panel as a reference. Bands are 95 %.
     """
     curves = [curve for curve in results["curves"] if len(curve["fmr"]) > 1]
     names = [name for name in datasets_of(results) if any(c["dataset"] == name for c in curves)]
@@ -57,32 +55,26 @@ def det_figure(results: Mapping[str, Any]) -> Figure | None:
     # Without lifting the reference alone makes one panel.
     modes = [mode for mode in LIFTED_MODES if mode in present] or ["p2p"]
     looks: dict[str, Look] = {"raw": {"color": INK, "linewidth": 2.2, "zorder": 4}}
-    handles: dict[str, Line2D] = {}
     with house_style():
         figure, grid = _panels(len(names), len(modes))
-        for line, name in zip(grid, names, strict=True):
-            for axes, mode in zip(line, modes, strict=True):
-                shown = shown_curves([c for c in curves if c["dataset"] == name], mode)
-                dims = sorted({curve["dim"] for curve in shown if curve["dim"]})
-                drawn = []
-                for curve in shown:
-                    label = strategy_label(curve)
-                    look = looks.setdefault(label, _look(len(looks) - 1))
-                    handles.setdefault(label, Line2D([], [], **look, label=label))
-                    dash = DASHES[1] if curve["dim"] in dims[:-1] else DASHES[0]
-                    drawn.append((curve, look | {"linestyle": dash}))
-                draw_det(axes, drawn, "FMR", "FNMR")
-                metric = next((c["metric"] for c in shown if c["mode"] == mode), None)
-                kind = MODE_NAMES[mode]
-                kind += f", {METRIC_NAMES[metric]}" if metric and mode in LIFTED_MODES else ""
-                axes.set_title(f"{name}, {kind}", loc="left")
-                for dim, dash, word in zip(
-                    (dims[-1:] + dims[:-1]), DASHES, ("solid", "dashed"), strict=False
-                ):
-                    key = f"{word}: m = {dim}"
-                    handles.setdefault(key, Line2D([], [], color=QUIET, linestyle=dash, label=key))
-        handles["equal"] = Line2D([], [], **EQUAL, label="FMR = FNMR")
-        side_legend(figure, list(handles.values()), SIDE_INCHES)
+        for axes, (name, mode) in zip(
+            (axes for line in grid for axes in line),
+            [(name, mode) for name in names for mode in modes],
+            strict=True,
+        ):
+            shown = shown_curves([c for c in curves if c["dataset"] == name], mode)
+            largest = max(curve["dim"] for curve in shown)
+            drawn = []
+            for curve in shown:
+                label = strategy_label(curve)
+                look = looks.setdefault(label, _look(len(looks) - 1))
+                dash = DASHES[1] if 0 < curve["dim"] < largest else DASHES[0]
+                dim = f", m = {curve['dim']}" if curve["dim"] else ""
+                drawn.append((curve, look | {"linestyle": dash, "label": label + dim}))
+            draw_det(axes, drawn, "FMR", "FNMR")
+            metric = next((METRIC_NAMES[c["metric"]] for c in shown if c["dim"]), None)
+            axes.set_title(", ".join(filter(None, [name, MODE_NAMES[mode], metric])), loc="left")
+        _legend(figure)
     return figure
 
 
@@ -94,25 +86,23 @@ def liveness_figure(results: Row) -> Figure:
     """
     live = int(results["rows"][0]["bpcer"]["trials"])
     half = {row["species"]: 0.5 / row["apcer"]["trials"] for row in results["rows"]}
-    drawn, handles = [], []
+    drawn = []
+    for number, curve in enumerate(results["curves"]):
+        bands = np.array([wilson(rate * live, live) for rate in curve["bpcer"]])
+        apcer = np.maximum(curve["apcer"], half[curve["species"]])
+        rates = {"fmr": apcer, "fnmr": curve["bpcer"], "low": bands[:, 0], "high": bands[:, 1]}
+        drawn.append((rates, _look(number) | {"label": curve["species"]}))
     with house_style():
         figure, grid = _panels(1, 1)
-        for number, curve in enumerate(results["curves"]):
-            bands = np.array([wilson(rate * live, live) for rate in curve["bpcer"]])
-            apcer = np.maximum(curve["apcer"], half[curve["species"]])
-            rates = {"fmr": apcer, "fnmr": curve["bpcer"], "low": bands[:, 0], "high": bands[:, 1]}
-            drawn.append((rates, _look(number)))
-            handles.append(Line2D([], [], **_look(number), label=curve["species"]))
         axes = grid[0][0]
         draw_det(axes, drawn, "APCER", "BPCER")
-        cross: Look = {"marker": "x", "color": QUIET, "linestyle": "none"}
-        for row in results["rows"]:
-            apcer_of_row = max(row["apcer"]["value"], half[row["species"]])
-            axes.plot([apcer_of_row], [row["bpcer"]["value"]], **cross)
+        axes.plot(
+            [max(row["apcer"]["value"], half[row["species"]]) for row in results["rows"]],
+            [row["bpcer"]["value"] for row in results["rows"]],
+            **{"marker": "x", "color": QUIET, "linestyle": "none", "label": "threshold"},
+        )
         axes.set_title(f"{results['dataset']['name']}, presentation attacks", loc="left")
-        handles += [Line2D([], [], **EQUAL, label="APCER = BPCER")]
-        handles += [Line2D([], [], **cross, label="threshold")]
-        side_legend(figure, handles, SIDE_INCHES)
+        _legend(figure)
     return figure
 
 
@@ -138,6 +128,18 @@ def _panels(rows: int, columns: int) -> tuple[Figure, list[list[Axes]]]:
     )
 
 
+def _legend(figure: Figure) -> None:
+    """Name every curve once, right of the panels."""
+    handles = {
+        str(handle.get_label()): handle
+        for axes in figure.axes
+        for handle in axes.get_legend_handles_labels()[0]
+    }
+    figure.legend(
+        handles=list(handles.values()), loc="center right", fontsize=SMALL_SIZE, handlelength=2.8
+    )
+
+
 def _look(number: int) -> Look:
     """Return how the curve of a strategy or species is drawn: hue and marker."""
     return {
@@ -150,7 +152,7 @@ def _look(number: int) -> Look:
     }
 
 
-def draw_det(axes: Axes, curves: Iterable[tuple[Row, Look]], x: str, y: str) -> None:
+def draw_det(axes: Axes, curves: Sequence[tuple[Row, Look]], x: str, y: str) -> None:
     """Draw the rate ``fnmr`` of each curve over its ``fmr``, with the band from low to high.
 
     Parameters
@@ -180,7 +182,8 @@ def draw_det(axes: Axes, curves: Iterable[tuple[Row, Look]], x: str, y: str) -> 
         names = [f"{100 * rate:.4f}".rstrip("0").rstrip(".") for rate in ticks]
         getattr(axes, f"set_{axis}ticks")(ticks, names)
         getattr(axes, f"set_{axis}lim")((low_end, high_end))
-    axes.plot([SMALLEST, 0.999], [SMALLEST, 0.999], **EQUAL)
+    ends = [SMALLEST, 0.999]
+    axes.plot(ends, ends, color=QUIET, linewidth=0.9, label=f"{x} = {y}")
     axes.set_xlabel(f"{x} %")
     axes.set_ylabel(f"{y} %")
     axes.grid(color=RULE, linewidth=0.8)

@@ -19,7 +19,6 @@ import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
-from matplotlib.lines import Line2D
 
 from templates.keys.private_file import replace_public
 
@@ -110,20 +109,6 @@ def panels(
         gridspec_kw={"width_ratios": list(widths), "height_ratios": list(heights)},
     )
     return figure, [list(line) for line in axes]
-
-
-def side_legend(figure: Figure, handles: Sequence[Line2D], side: float) -> None:
-    """Put the legend into the band right of the panels."""
-    left = 1 - side / figure.get_figwidth()
-    figure.legend(
-        handles=handles,
-        loc="center left",
-        bbox_to_anchor=(left + 0.1 / figure.get_figwidth(), 0.5),
-        fontsize=SMALL_SIZE + 0.5,
-        handlelength=2.8,
-        labelspacing=0.6,
-        borderaxespad=0,
-    )
 
 
 def name_groups(
