@@ -383,7 +383,7 @@ def measure(args: argparse.Namespace) -> list[dict[str, object]]:
         missed = planted_and_missed(opened, people[0].probes[0], search)
         tabs = [first.tab, opened.tab, looked, second]
         complaints = [complaint for tab in tabs for complaint in tab.complaints]
-        complaints += [*opened.tab.violations(), *again.violations()]
+        complaints += [*opened.tab.violations(), *second.violations()]
         # Each tab has noted every request of the browser.
         here = (served.url, recording.url, "blob:", "data:")
         strays = sorted({each for each in first.tab.requests if not each.startswith(here)})
