@@ -1,6 +1,8 @@
 """Is this face good enough to enroll or to verify? Measures, limits, and named refusals."""
 
+import math
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -247,35 +249,18 @@ def check(
         raise FaceTooSmall(
             f"The face is {quality.face_size:.0f} pixels wide; at least"
             f" {limits.min_face_size:.0f} are needed. Come closer or send a larger photo.",
-            details={"size": _measured(quality.face_size, limits.min_face_size)},
+            details={"size": {"value": round(quality.face_size, 3), "limit": limits.min_face_size}},
         )
-    min_score = recommended_score if limits.min_score is None else limits.min_score
-    failed: dict[str, object] = {}
-    if quality.score is not None and quality.score < min_score:
-        failed["score"] = _measured(quality.score, min_score)
-    if quality.sharpness < limits.min_sharpness:
-        failed["blur"] = _measured(quality.sharpness, limits.min_sharpness)
-    if quality.exposure < limits.min_exposure:
-        failed["darkness"] = _measured(quality.exposure, limits.min_exposure)
-    elif quality.brightness < limits.min_brightness:
-        failed["darkness"] = _measured(quality.brightness, limits.min_brightness)
-    if quality.brightness > limits.max_brightness:
-        failed["brightness"] = _measured(quality.brightness, limits.max_brightness)
-    if quality.roll is not None and abs(quality.roll) > limits.max_roll:
-        failed["turned"] = _measured(quality.roll, limits.max_roll)
-    angles = {
-        "yaw": (quality.yaw, limits.max_yaw),
-        "pitch": (quality.pitch, limits.max_pitch),
-    }
-    pose = {
-        name: _measured(value, limit)
-        for name, (value, limit) in angles.items()
-        if value is not None and abs(value) > limit
-    }
-    if pose:
-        failed["pose"] = pose
-    if hidden := _hidden(quality, limits):
-        failed["hidden"] = hidden
+    failed: dict[str, Any] = {}
+    for name, part, value, least, most in _limited(quality, limits, recommended_score):
+        if value is None or least <= value <= most:
+            continue
+        limit = abs(least if value < least else most)
+        measured = {"value": round(value, 3), "limit": limit}
+        if part is None:
+            failed.setdefault(name, measured)
+        else:
+            failed.setdefault(name, {})[part] = measured
     if failed:
         remedies = " ".join(_REMEDIES[name] for name in failed)
         raise LowQuality(
@@ -283,20 +268,29 @@ def check(
         )
 
 
-def _hidden(quality: Quality, limits: QualityLimits) -> dict[str, dict[str, float]]:
-    """What says that part of the face is covered, or lies outside the picture.
+def _limited(
+    quality: Quality, limits: QualityLimits, recommended_score: float
+) -> list[tuple[str, str | None, float | None, float, float]]:
+    """List the measures: failure that each belongs to, part of it, value, least and most.
 
-    A detector puts five points on what it sees of a face, as if all of it were there. They then
-    reach the border of the picture, and the box, which goes round what is seen, is too narrow for
-    its height. A picture that was squeezed has such a box too. What covers a face from above or
-    from below leaves the box wide enough.
+    A detector puts five points on what it sees of a face, as if all of it were there. Where part of
+    the face is covered, or lies outside the picture, they reach the border of the picture, and the
+    box, which goes round what is seen, is too narrow for its height. A picture that was squeezed
+    has such a box too. What covers a face from above or from below leaves the box wide enough.
     """
-    hidden = {}
-    if quality.border is not None and quality.border < limits.min_border:
-        hidden["border"] = _measured(quality.border, limits.min_border)
-    if quality.aspect is not None and quality.aspect > limits.max_aspect:
-        hidden["aspect"] = _measured(quality.aspect, limits.max_aspect)
-    return hidden
+    min_score = recommended_score if limits.min_score is None else limits.min_score
+    return [
+        ("score", None, quality.score, min_score, math.inf),
+        ("blur", None, quality.sharpness, limits.min_sharpness, math.inf),
+        ("darkness", None, quality.exposure, limits.min_exposure, math.inf),
+        ("darkness", None, quality.brightness, limits.min_brightness, math.inf),
+        ("brightness", None, quality.brightness, -math.inf, limits.max_brightness),
+        ("turned", None, quality.roll, -limits.max_roll, limits.max_roll),
+        ("pose", "yaw", quality.yaw, -limits.max_yaw, limits.max_yaw),
+        ("pose", "pitch", quality.pitch, -limits.max_pitch, limits.max_pitch),
+        ("hidden", "border", quality.border, limits.min_border, math.inf),
+        ("hidden", "aspect", quality.aspect, -math.inf, limits.max_aspect),
+    ]
 
 
 _REMEDIES = {
@@ -308,7 +302,3 @@ _REMEDIES = {
     "pose": "Look into the camera.",
     "hidden": "Show the whole face, with nothing before it and some room around it.",
 }
-
-
-def _measured(value: float, limit: float) -> dict[str, float]:
-    return {"value": round(value, 3), "limit": limit}
