@@ -3,8 +3,8 @@
 Imports the layer below only: ``templates`` and ``models``.
 """
 
-from verify.calibration import Calibrated, CalibrationReport, calibrate
-from verify.calibration_mode import CalibrationOptions
+from verify.calibration import Calibrated, calibrate
+from verify.calibration_mode import CalibrationOptions, CalibrationReport
 from verify.challenge import MAX_FRAMES, MIN_FRAMES, Movement, draw_movements
 from verify.datasets import DatasetError, LabelledFolder, labelled_folder, read_lfw_pairs
 from verify.decision import Decision, StandIn

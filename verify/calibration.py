@@ -16,21 +16,16 @@ from templates.space.embedding import unit_descriptors
 from templates.space.lifting import plain_strategy
 from verify.calibration_mode import (
     CalibrationOptions,
+    CalibrationReport,
     CalibrationRun,
-    ModeResult,
     calibrate_lifted,
     calibrate_points,
     point_sets,
 )
 from verify.comparisons import Lifter, Progress, honest_norms
-from verify.consistency import (
-    Consistency,
-    SuspiciousPair,
-    photo_consistency,
-    suspicious_pairs,
-)
+from verify.consistency import photo_consistency, suspicious_pairs
 from verify.group_rates import PeopleGroups, PhotoLabels, people_groups
-from verify.tenfold import Pair, TenFold, pair_arrays, random_pairs, require_folds
+from verify.tenfold import Pair, pair_arrays, random_pairs, require_folds
 from verify.trials import ProbeSets, TrialPlan, chosen_photos, enrolled_means, plan_trials
 
 SUSPICIOUS_ABOVE = 0.5
@@ -43,32 +38,6 @@ DEVIATIONS = 6.0
 """Of similarities to strangers, above the mean of honest templates: the largest that passes."""
 DEFAULT_LEVELS = ("fmr-1e-4", "fmr-1e-3", "fmr-1e-2")
 """The first that all calibrations resolve is the default; 1e-4 is NIST SP 800-63B-4's."""
-
-
-@dataclass(frozen=True)
-class CalibrationReport:
-    """What an operator should read beside the contract.
-
-    Parameters
-    ----------
-    unresolved
-        Sentences about the FMR targets that the data cannot resolve.
-    left_out
-        Sentences about the groups whose trials are too few for ``worst_group`` to heed them.
-    suspicious
-        People who may be one person under two names: look at them before believing a threshold
-        at FMR 1e-4 or below, then name them in ``aliases`` (docs/thresholds.md "One person under
-        two names").
-    ten_folds
-        Results of the ten-fold protocol, one per calibration in the contract's order; empty
-        under protocol ``fmr``.
-    """
-
-    consistency: Consistency
-    unresolved: tuple[str, ...]
-    left_out: tuple[str, ...]
-    suspicious: tuple[SuspiciousPair, ...]
-    ten_folds: tuple[TenFold, ...]
 
 
 @dataclass(frozen=True)
@@ -162,6 +131,9 @@ def calibrate(
     consistency = photo_consistency(
         data, plan.person_of, photos=options.photos_per_enrollment, rng=rng
     )
+    report = CalibrationReport(
+        consistency, suspicious_pairs(data, plan.person_of, plan.people, above=SUSPICIOUS_ABOVE)
+    )
     service = Lifter(binding.strategy, source, binding.contract_id)
     generator = client_source(source)
     progress("enrolling people", 0.0)
@@ -183,7 +155,7 @@ def calibrate(
         client=Lifter(plain_strategy(binding.strategy), generator, binding.contract_id),
         pairs=placed,
         groups=groups,
-        consistency=consistency,
+        report=report,
         options=options,
         facts={
             "dataset": dataset,
@@ -200,34 +172,20 @@ def calibrate(
         progress=progress,
     )
     progress("comparing probes with templates", _ENROLLED)
-    results: list[ModeResult] = []
+    calibrations: list[Calibration] = []
     sets = point_sets(run, rng) if 0 in options.probe_dims else []
-    dims = [dim for dim in options.probe_dims if dim]
-    kinds: list[ProbeSets | int] = [*sets, *dims]
+    kinds: list[ProbeSets | int] = [*sets, *(dim for dim in options.probe_dims if dim)]
     for number, kind in enumerate(kinds):
         first, last = (
             _ENROLLED + (1 - _ENROLLED) * done / len(kinds) for done in (number, number + 1)
         )
         part = replace(run, progress=part_of(progress, first, last))
-        results.append(
+        calibrations.append(
             calibrate_lifted(part, kind, rng)
             if isinstance(kind, int)
             else calibrate_points(part, kind)
         )
-    calibrations = [result.calibration for result in results]
-    contract = _contract(run, binding, calibrations, recorded or {})
-    return Calibrated(
-        contract,
-        CalibrationReport(
-            consistency=consistency,
-            unresolved=tuple(sentence for one in results for sentence in one.unresolved),
-            left_out=tuple(sentence for one in results for sentence in one.left_out),
-            suspicious=tuple(
-                suspicious_pairs(data, plan.person_of, plan.people, above=SUSPICIOUS_ABOVE)
-            ),
-            ten_folds=tuple(one.folds for one in results if one.folds is not None),
-        ),
-    )
+    return Calibrated(_contract(run, binding, calibrations, recorded or {}), report)
 
 
 def _contract(
@@ -236,7 +194,7 @@ def _contract(
     calibrations: Sequence[Calibration],
     recorded: Mapping[str, Json],
 ) -> Contract:
-    consistency, near = run.consistency, run.nobody.stranger_similarity(run.templates)
+    consistency, near = run.report.consistency, run.nobody.stranger_similarity(run.templates)
     return Contract(
         binding=binding,
         recorded={

@@ -1,7 +1,7 @@
 """One calibration of a contract: one mode, one metric, one kind of probe."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -24,7 +24,7 @@ from verify.comparisons import (
     pair_similarities,
     point_trials,
 )
-from verify.consistency import Consistency
+from verify.consistency import Consistency, SuspiciousPair
 from verify.group_rates import PeopleGroups, group_rates, worst_group_threshold
 from verify.metrics import threshold_at_fmr
 from verify.tenfold import Pair, TenFold, pair_arrays, ten_fold
@@ -104,23 +104,29 @@ class CalibrationOptions:
 
 
 @dataclass(frozen=True)
-class ModeResult:
-    """A calibration, and what an operator should read beside it.
+class CalibrationReport:
+    """What an operator should read beside the contract; every calibration adds to its lists.
 
     Parameters
     ----------
+    suspicious
+        People who may be one person under two names: look at them before believing a threshold
+        at FMR 1e-4 or below, then name them in ``aliases`` (docs/thresholds.md "One person under
+        two names").
     unresolved
-        Sentences about the targets that they do not.
+        Sentences about the FMR targets that the data cannot resolve.
     left_out
-        Sentences about the groups that ``worst_group`` could not heed.
-    folds
-        Result of the ten-fold protocol; None under protocol ``fmr``.
+        Sentences about the groups whose trials are too few for ``worst_group`` to heed them.
+    ten_folds
+        Results of the ten-fold protocol, one per calibration in the contract's order; empty
+        under protocol ``fmr``.
     """
 
-    calibration: Calibration
-    unresolved: list[str]
-    left_out: list[str]
-    folds: TenFold | None
+    consistency: Consistency
+    suspicious: list[SuspiciousPair]
+    unresolved: list[str] = field(default_factory=list)
+    left_out: list[str] = field(default_factory=list)
+    ten_folds: list[TenFold] = field(default_factory=list)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -138,7 +144,7 @@ class CalibrationRun:
     client: Lifter
     pairs: tuple[Pair, ...]
     groups: tuple[PeopleGroups, ...]
-    consistency: Consistency
+    report: CalibrationReport
     options: CalibrationOptions
     facts: Mapping[str, Json]
     progress: Progress
@@ -159,7 +165,7 @@ def point_sets(run: CalibrationRun, rng: np.random.Generator) -> list[ProbeSets]
     return chosen
 
 
-def calibrate_points(run: CalibrationRun, sets: ProbeSets) -> ModeResult:
+def calibrate_points(run: CalibrationRun, sets: ProbeSets) -> Calibration:
     """Calibrate raw probes of one number of photos."""
     impostors, genuine = point_trials(
         run.descriptors,
@@ -168,13 +174,13 @@ def calibrate_points(run: CalibrationRun, sets: ProbeSets) -> ModeResult:
         run.nobody,
         sets,
         metric=run.options.metric,
-        consistency=run.consistency.probe_threshold,
+        consistency=run.report.consistency.probe_threshold,
         progress=run.progress,
     )
     return _calibration(run, impostors, genuine, probe_photos=sets.photos.shape[1])
 
 
-def calibrate_lifted(run: CalibrationRun, probe_m: int, rng: np.random.Generator) -> ModeResult:
+def calibrate_lifted(run: CalibrationRun, probe_m: int, rng: np.random.Generator) -> Calibration:
     """Calibrate lifted probes of one dimension."""
     options = run.options
     with Keystream.seeded("calibration probes", options.seed, probe_m) as stream:
@@ -210,7 +216,7 @@ def _calibration(
     probe_m: int = 0,
     probe_photos: int = 1,
     norms: tuple[float, float] | None = None,
-) -> ModeResult:
+) -> Calibration:
     """Set the levels that the trials resolve."""
     options = run.options
     kept, unresolved = resolved_targets(impostors, options.targets)
@@ -248,9 +254,15 @@ def _calibration(
         "impostor_sample": sample,
     }
     if folds is not None:
+        run.report.ten_folds.append(folds)
         facts["ten_fold_accuracy"] = folds.accuracy_mean
         facts["ten_fold_std"] = folds.accuracy_std
-    calibration = Calibration(
+    where = (
+        f"probe m = {probe_m}: " if probe_m else f"raw probes of {photos_in_words(probe_photos)}: "
+    )
+    run.report.unresolved.extend(where + sentence for sentence in unresolved)
+    run.report.left_out.extend(where + sentence for sentence in left_out)
+    return Calibration(
         mode="s2s" if probe_m else "p2s",
         metric=options.metric,
         probe_m=probe_m,
@@ -259,15 +271,6 @@ def _calibration(
         levels=tuple(levels),
         foot_point_norm=norms,
         calibrated_on=facts,
-    )
-    where = (
-        f"probe m = {probe_m}: " if probe_m else f"raw probes of {photos_in_words(probe_photos)}: "
-    )
-    return ModeResult(
-        calibration,
-        [where + sentence for sentence in unresolved],
-        [where + sentence for sentence in left_out],
-        folds,
     )
 
 
