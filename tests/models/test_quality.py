@@ -85,7 +85,7 @@ def test_the_good_pass():
         ({"brightness": 253.0}, "brightness"),
         ({"yaw": -88.0}, "pose"),
         ({"pitch": 80.0}, "pose"),
-        ({"roll": 179.0}, "turned"),
+        ({"roll": -179.0}, "turned"),
         ({"border": -0.1}, "hidden"),
         ({"aspect": 2.1}, "hidden"),
     ],

@@ -45,9 +45,9 @@ def by_hand(scores: NDArray[np.float32], members: NDArray[np.bool_]) -> NDArray[
 
 @pytest.fixture
 def worse() -> tuple[NDArray[np.float32], PhotoLabels]:
-    """300 people, of whom 60 "b" score 1 higher among themselves; 5 "c" are too few."""
+    """60 "b" score 1 higher among themselves; 5 "c" are too few to judge, 25 "d" to set by."""
     rng = np.random.default_rng(3)
-    names = ["a"] * 200 + ["b"] * 60 + ["c"] * 5 + [None] * 35
+    names = ["a"] * 200 + ["b"] * 60 + ["c"] * 5 + ["d"] * 25 + [None] * 10
     scores = rng.normal(size=(300, 300))
     scores[200:260, 200:260] += 1
     return scores.astype(np.float32), PhotoLabels({"kind": names}, "drawn")
@@ -68,7 +68,7 @@ def test_rates_are_those_of_the_trials_within(worse) -> None:
     level = Level("fmr-1e-2", 1e-2, 2.3, some, some)
     found = group_rates(level, groups, impostors, genuine)
     assert [(entry.attribute, entry.group) for entry in found] == [
-        *(("kind", name) for name in "abc"),
+        *(("kind", name) for name in "abcd"),
     ]
     for entry in found:
         members = np.array([name == entry.group for name in labels.of["kind"]])
@@ -79,8 +79,8 @@ def test_rates_are_those_of_the_trials_within(worse) -> None:
         rejected = int(((genuine.scores < 2.3) | genuine.refused)[members].sum())
         assert (entry.frr.errors, entry.frr.trials) == (rejected, members.sum())
     # 20 trials of "c" are fewer than 1 / 0.01, and only "a" has 100 genuine ones.
-    assert [entry.fmr_judged for entry in found] == [True, True, False]
-    assert [entry.frr_judged for entry in found] == [True, False, False]
+    assert [entry.fmr_judged for entry in found] == [True, True, False, True]
+    assert [entry.frr_judged for entry in found] == [True, False, False, False]
     accuracy = group_rates(replace(level, target_fmr=None), groups, impostors, genuine)
     assert not any(entry.fmr_judged for entry in accuracy)
 
@@ -101,7 +101,7 @@ def test_the_threshold_of_the_worst_group_is_the_smallest_that_holds(worse, targ
     # One more accepted score of the worst group would exceed the target.
     below = b[b < found].max()
     assert np.mean(b >= below) > target
-    assert left_out == ["kind c (20)"]
+    assert left_out == ["kind c (20)", "kind d (600)"]
 
 
 def test_people_are_what_most_of_their_photos_are() -> None:

@@ -99,7 +99,10 @@ def liveness_figure(results: Row) -> Figure:
         axes.plot(
             [max(row["apcer"]["value"], half[row["species"]]) for row in results["rows"]],
             [row["bpcer"]["value"] for row in results["rows"]],
-            **{"marker": "x", "color": QUIET, "linestyle": "none", "label": "threshold"},
+            marker="x",
+            color=QUIET,
+            linestyle="none",
+            label="threshold",
         )
         axes.set_title(f"{results['dataset']['name']}, presentation attacks", loc="left")
         _legend(figure)
