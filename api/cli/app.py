@@ -19,7 +19,8 @@ COMMANDS = {
     "demo": "Enroll, verify and erase people through the real service, in under a minute.",
     "setup": "Prepare a service from a model pack and folders of photos, and judge it.",
     "serve": "Start the REST service.",
-    "enroll": "Enroll a person from photos, or replace their enrollment.",
+    "enroll": "Enroll a person from photos, or replace their enrollment; or enroll many with "
+    "--from.",
     "verify": "Check whether photos show a person; exit status 0 if accepted, 1 if rejected.",
     "lift": "Make a private template from photos on this machine, without any secret of the "
     "service.",

@@ -1,14 +1,16 @@
 """Folders of photos that bulk commands are given; what is not read of them is named."""
 
-from collections.abc import Iterator, Sequence
+import csv
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from api.cli.console import message
-from api.cli.errors import CommandError
+from api.cli.errors import CommandError, UsageError
 from verify import LabelledFolder, labelled_folder
 from verify.datasets import SUFFIXES, distinct_files, is_photo, photos_alone, visible
 
+COLUMNS = ("subject", "photo")
 _MOST_NAMED = 5
 _ENDINGS = ", ".join(sorted(SUFFIXES))
 
@@ -55,6 +57,43 @@ def labelled_people(folder: Path) -> LabelledFolder:
     _tell_copies(folder, len(labelled) - len(kept))
     paths, identities = zip(*kept, strict=True)
     return replace(labelled, paths=paths, identities=identities)
+
+
+def albums_of(source: Path) -> Mapping[str, Sequence[Path]]:
+    """Photos by person, of ``source/Person/photo.jpg`` or of a CSV file with a photo on each line.
+
+    The file has the columns ``subject`` and ``photo``, a path relative to the file.
+
+    Raises
+    ------
+    UsageError
+        The file lacks a column, or a line a value.
+    DatasetError
+        As of `verify.labelled_folder`.
+    """
+    albums: dict[str, list[Path]] = {}
+    if source.is_dir():
+        labelled = labelled_people(source)
+        for path, name in zip(labelled.paths, labelled.identities, strict=True):
+            albums.setdefault(name, []).append(path)
+        return albums
+    try:
+        with source.open(encoding="utf-8-sig", newline="") as file:
+            rows = csv.DictReader(file)
+            if not set(COLUMNS) <= set(rows.fieldnames or ()):
+                raise UsageError(f"{source} needs a first line with the columns subject,photo")
+            for row in rows:
+                subject, photo = (row[name] for name in COLUMNS)
+                if not subject or not photo:
+                    raise UsageError(f"{source}, line {rows.line_num}: a subject and a photo")
+                albums.setdefault(subject, []).append(source.parent / photo)
+    except FileNotFoundError:
+        raise UsageError(f"{source} is neither a folder nor a CSV file") from None
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise UsageError(f"{source} cannot be read as CSV: {error}") from None
+    if not albums:
+        raise UsageError(f"{source} names nobody")
+    return albums
 
 
 def people_or_faces(folder: Path) -> LabelledFolder:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from sqlalchemy.engine import make_url
 
 from api.cli.calibrate import suspicious_lines
 from api.cli.calibration import calibrate_folder, default_probe_dims
@@ -153,7 +154,7 @@ def setup(
 
         text += [] if serve else ["Start it: veilface serve"]
         text += _calls(service_url(settings), key_file)
-    text += plain_lines(contract.verdict)
+    text += plain_lines(contract.verdict, strangers=labelled is None)
     present(Result(facts, text, error=error), json=as_json)
     if serve:
         # Anew: this process has run the models, and what accelerators have begun outlives no fork.
@@ -377,6 +378,13 @@ def _write_settings(settings: Settings, steps: dict[str, str]) -> str | None:
     """
     names = ["data_dir", "pack"]
     names += ["master_key_file"] if settings.master_key_file is not None else []
+    if settings.database_url is not None:
+        if make_url(settings.database_url).password is None:
+            names.append("database_url")
+        else:
+            message(
+                "note: the database's URL has a password, and is in no file: give it to `serve`"
+            )
     if settings.providers != Settings.model_fields["providers"].default:
         names.append("providers")
     text = settings_text({name: getattr(settings, name) for name in names}, HEADER)

@@ -1,22 +1,25 @@
 """``veilface enroll`` and ``veilface verify``: on this machine, against the store itself."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from api.cli.console import counted, demo_notice, message
-from api.cli.errors import CommandError, UsageError
+from api.cli.console import counted, demo_notice, message, progress
+from api.cli.errors import CommandError, UsageError, sentence
 from api.cli.files import read_photo
 from api.cli.options import LOCAL, Tenant
-from api.cli.results import Result, reports
+from api.cli.photo_folders import albums_of
+from api.cli.results import Result, Table, reports
 from api.http.audit import operator
 from api.http.errors import ApiError
 from api.service.opening import weak_privacy
 from api.service.runtime import Runtime
 from api.settings import Settings
+from enroll import Enrollment
 from enroll.enroller import MAX_PHOTOS, Holder
 from models.errors import PhotoRejected
 from models.pack import ModelPack
@@ -29,8 +32,9 @@ from templates.keys.holder_key import (
 )
 from templates.space.agreement import InconsistentImages
 from templates.store.audit_log import Entry
+from templates.store.identifiers import InvalidIdentifier
 from templates.store.subject_rows import Source
-from templates.store.subjects import Precondition
+from templates.store.subjects import EnrollmentConflict, Precondition
 from verify import MAX_PROBE_PHOTOS, probe_of_photos
 
 Subject = Annotated[str, typer.Argument(help="Id of the person.")]
@@ -51,13 +55,25 @@ HolderKeyFile = Annotated[
 
 @reports(*LOCAL)
 def enroll(
-    subject: Subject,
+    subject: Annotated[
+        str | None, typer.Argument(help="Id of the person.", show_default=False)
+    ] = None,
     photos: Annotated[
-        list[Path],
-        typer.Argument(help=f"1 to {MAX_PHOTOS} photos of that person."),
-    ],
+        list[Path] | None,
+        typer.Argument(help=f"1 to {MAX_PHOTOS} photos of that person.", show_default=False),
+    ] = None,
     *,
     settings: Settings,
+    people: Annotated[
+        Path | None,
+        typer.Option(
+            "--from",
+            metavar="PEOPLE",
+            help="Enroll many: a folder with a subfolder of photos for each person, whose name is "
+            f"the id; or a CSV file with the columns subject and photo. At most {MAX_PHOTOS} "
+            "photos of each are taken.",
+        ),
+    ] = None,
     gender: Annotated[
         str | None,
         typer.Option(help="For a hybrid+ contract: used for lifting, never stored."),
@@ -85,68 +101,157 @@ def enroll(
         ),
     ] = None,
 ) -> Result:
-    """Enroll a person from photos, or replace their enrollment.
+    """Enroll a person from photos, or replace their enrollment; or enroll many with --from.
 
     Needs: what `serve` needs (contract, decoys, pack); the service may run meanwhile. All photos
-    must show the same person. Only the private template is stored. With a holder's key it accepts
-    nobody without that key, which is not stored: who loses the file enrolls again.
+    must show the same person: three are better than one. Only the private template is stored. With
+    a holder's key it accepts nobody without that key, which is not stored: who loses the file
+    enrolls again. With --from, exit status 1 means that somebody was not enrolled; the others are.
 
     Example: `veilface enroll alice alice-1.jpg alice-2.jpg alice-3.jpg --pack buffalo_l`
     """
-    if len(photos) > MAX_PHOTOS:
-        raise UsageError(f"an enrollment has 1 to {MAX_PHOTOS} photos, not {len(photos)}")
     if no_replace and replace is not None:
         raise UsageError("give --no-replace or --replace, not both")
-    may_replace_all = not no_replace and replace is None
+    precondition = None if not no_replace and replace is None else Precondition(replace)
+    attributes = Attributes(gender, race)
+    if people is not None:
+        if subject is not None or replace or holder_key_file or new_holder_key_file:
+            raise UsageError("--from enrolls many: no SUBJECT, --replace or holder's key beside it")
+        albums = albums_of(people)
+        with _opened(settings, tenant) as entrance:
+            return _enrolled_all(entrance, albums, attributes, face, precondition)
+    if subject is None or not photos:
+        raise UsageError("name a person and 1 to 10 photos; or many people with --from")
+    if len(photos) > MAX_PHOTOS:
+        raise UsageError(f"an enrollment has 1 to {MAX_PHOTOS} photos, not {len(photos)}")
     if holder_key_file is not None and new_holder_key_file is not None:
         raise UsageError("give --holder-key-file or --new-holder-key-file, not both")
     if new_holder_key_file is not None:
         holder_key: bytearray | None = new_holder_key()
     else:
         holder_key = None if holder_key_file is None else read_holder_key(holder_key_file)
-    data = [read_photo(photo, settings.max_image_bytes) for photo in photos]
-    with _opened(settings, tenant) as (runtime, pack, name):
-        epoch = runtime.epoch(name)
-        with _named(photos):
-            enrollment = runtime.enroller(name, epoch).from_photos(
-                pack,
-                data,
-                attributes=Attributes(gender, race),
-                holder=None if holder_key is None else Holder(holder_key, name, subject),
-                policy=face,
-                limits=runtime.image_limits,
-            )
+    with _opened(settings, tenant) as entrance:
+        holder = None if holder_key is None else Holder(holder_key, entrance.tenant, subject)
+        prepared = _prepared(entrance, photos, attributes, face, holder)
         if new_holder_key_file is not None and holder_key is not None:
             # Before the enrollment, which is of no use without it.
             write_holder_key(new_holder_key_file, holder_key)
-        stored = runtime.put(
-            name,
-            subject,
-            epoch,
-            enrollment,
-            source=Source.PHOTOS,
-            photos=len(photos),
-            precondition=None if may_replace_all else Precondition(replace),
-            by=operator(),
-        )
-        if (weakness := weak_privacy(runtime.contract)) is not None:
-            message(f"note: privacy is not proven: {weakness}")
-    notice = demo_notice(pack.info.embedder_sha256, n=pack.info.n)
-    done = "Enrolled" if stored.created else "Replaced the enrollment of"
+        facts = _stored(entrance, subject, prepared, len(photos), precondition)
+        _note_privacy(entrance.runtime)
+    notice = demo_notice(entrance.pack.info.embedder_sha256, n=entrance.pack.info.n)
+    done = "Replaced the enrollment of" if facts["replaced"] else "Enrolled"
     return Result(
         {
-            "subject_id": subject,
-            "tenant": name,
-            "template_id": stored.template_id,
-            "contract_id": enrollment.contract_id,
-            "replaced": not stored.created,
-            "holder_key": enrollment.holder_salt is not None,
-            "photos": len(photos),
+            **facts,
+            "tenant": entrance.tenant,
+            "holder_key": prepared[1].holder_salt is not None,
             **notice,
         },
-        f"{done} {subject} from {counted(len(photos), 'photo')}; stored {len(enrollment.wire)} "
+        f"{done} {subject} from {counted(len(photos), 'photo')}; stored {len(prepared[1].wire)} "
         "bytes.",
     )
+
+
+@dataclass(frozen=True)
+class _Entrance:
+    """What enrolls and verifies: the deployment, its pack, and a tenant's name."""
+
+    runtime: Runtime
+    pack: ModelPack
+    tenant: str
+
+
+_SEVERAL_FACES = "A photo that shows several faces is taken with --face dominant or largest."
+
+
+def _enrolled_all(
+    entrance: _Entrance,
+    albums: Mapping[str, Sequence[Path]],
+    attributes: Attributes,
+    face: FacePolicy,
+    precondition: Precondition | None,
+) -> Result:
+    """Enroll everybody who can be, and say who could not and why."""
+    enrolled: list[dict[str, Any]] = []
+    failed: list[dict[str, str]] = []
+    with progress("enrolling people", len(albums)) as advance:
+        for subject, album in albums.items():
+            photos = album[:MAX_PHOTOS]
+            try:
+                prepared = _prepared(entrance, photos, attributes, face, None)
+                enrolled.append(_stored(entrance, subject, prepared, len(photos), precondition))
+            except (CommandError, EnrollmentConflict, InvalidIdentifier, OSError) as error:
+                failed.append({"subject_id": subject, "message": sentence(error)})
+            advance(1)
+    _note_privacy(entrance.runtime)
+    info = entrance.pack.info
+    notice = demo_notice(info.embedder_sha256, n=info.n)
+    why = [(one["subject_id"], one["message"]) for one in failed]
+    report: list[str | Table] = []
+    if failed:
+        report = [Table("Not enrolled", ("person", "why"), why), _SEVERAL_FACES]
+    used = sum(one["photos"] for one in enrolled)
+    text = f"Enrolled {len(enrolled):,} of {len(albums):,} people, from {counted(used, 'photo')}."
+    return Result(
+        {"tenant": entrance.tenant, "enrolled": enrolled, "failed": failed, **notice},
+        [*report, text],
+        status=1 if failed else 0,
+    )
+
+
+def _prepared(
+    entrance: _Entrance,
+    photos: Sequence[Path],
+    attributes: Attributes,
+    face: FacePolicy,
+    holder: Holder | None,
+) -> tuple[int, Enrollment]:
+    """Make the template of some photos; returned with the epoch of its rotation."""
+    runtime, pack, tenant = entrance.runtime, entrance.pack, entrance.tenant
+    data = [read_photo(photo, runtime.settings.max_image_bytes) for photo in photos]
+    epoch = runtime.epoch(tenant)
+    with _named(photos):
+        return epoch, runtime.enroller(tenant, epoch).from_photos(
+            pack,
+            data,
+            attributes=attributes,
+            holder=holder,
+            policy=face,
+            limits=runtime.image_limits,
+        )
+
+
+def _stored(
+    entrance: _Entrance,
+    subject: str,
+    prepared: tuple[int, Enrollment],
+    photos: int,
+    precondition: Precondition | None,
+) -> dict[str, Any]:
+    """Store the template of somebody; returned is what ``--json`` says of it."""
+    epoch, enrollment = prepared
+    stored = entrance.runtime.put(
+        entrance.tenant,
+        subject,
+        epoch,
+        enrollment,
+        source=Source.PHOTOS,
+        photos=photos,
+        precondition=precondition,
+        by=operator(),
+    )
+    return {
+        "subject_id": subject,
+        "template_id": stored.template_id,
+        "contract_id": enrollment.contract_id,
+        "replaced": not stored.created,
+        "photos": photos,
+    }
+
+
+def _note_privacy(runtime: Runtime) -> None:
+    if (weakness := weak_privacy(runtime.contract)) is not None:
+        message(f"note: privacy is not proven: {weakness}")
 
 
 @reports(*LOCAL)
@@ -185,7 +290,8 @@ def verify(
         raise UsageError(f"a verification takes 1 to {MAX_PROBE_PHOTOS} photos, not {len(photos)}")
     holder_key = None if holder_key_file is None else read_holder_key(holder_key_file)
     data = [read_photo(photo, settings.max_image_bytes) for photo in photos]
-    with _opened(settings, tenant) as (runtime, pack, name):
+    with _opened(settings, tenant) as entrance:
+        runtime, pack, name = entrance.runtime, entrance.pack, entrance.tenant
         read = runtime.read(name, subject)
         if read is None:
             raise CommandError(f"nobody is enrolled as {subject!r} in tenant {name}")
@@ -238,8 +344,8 @@ def _named(photos: Sequence[Path]) -> Iterator[None]:
 
 
 @contextmanager
-def _opened(settings: Settings, tenant: str | None) -> Iterator[tuple[Runtime, ModelPack, str]]:
-    """Open the deployment; with its pack, and the tenant's name.
+def _opened(settings: Settings, tenant: str | None) -> Iterator[_Entrance]:
+    """Open the deployment.
 
     Only the default tenant is made where it is missing.
     """
@@ -249,6 +355,6 @@ def _opened(settings: Settings, tenant: str | None) -> Iterator[tuple[Runtime, M
             raise UsageError("photos need a model pack; name it with --pack")
         tenants, name = runtime.store.tenants, tenant or settings.default_tenant
         known = tenants.create(name) if name == settings.default_tenant else tenants.get(name)
-        yield runtime, runtime.pack, known.name
+        yield _Entrance(runtime, runtime.pack, known.name)
     finally:
         runtime.close()

@@ -78,18 +78,34 @@ LIKE_PHOTOS, LIKE_OPENED = 600, (136, 3_600)
 had been adapted to so many or more: docs/results/privacy.md, 26 November 2026."""
 
 
-def plain_lines(verdict: Verdict | None) -> tuple[str, str]:
+STRANGERS_OPENED = "1 person in 7 to 1 in 12"
+"""Of LFW's people, behind decoys of FairFace's faces that were proven on FairFace's people: 8 to
+15 % (docs/privacy.md, November 2026)."""
+
+
+def plain_lines(verdict: Verdict | None, *, strangers: bool = False) -> tuple[str, str]:
     """Say to somebody who knows no biometrics how private and how accurate a contract is.
 
-    Every figure is the verdict's own, but what more photos would bring, which is named as measured
-    elsewhere.
+    Every figure is the verdict's own, except for what was measured elsewhere, which is named so.
+
+    Parameters
+    ----------
+    strangers
+        Whether it was judged on faces that may not look like those who will be enrolled.
     """
     if verdict is None:
         return (
             "Privacy: not proven: nobody measured it. `veilface calibrate` does.",
             "Accuracy: not measured.",
         )
-    return _plain_privacy(verdict.privacy), _plain_accuracy(verdict.accuracy)
+    privacy = _plain_privacy(verdict.privacy)
+    if strangers:
+        privacy += (
+            " This is measured on people of --faces; of LFW's people, behind decoys of FairFace's "
+            f"faces, it was {STRANGERS_OPENED} (docs/privacy.md, November 2026). PEOPLE like yours "
+            "tell you more."
+        )
+    return privacy, _plain_accuracy(verdict.accuracy)
 
 
 def _plain_privacy(privacy: Judgement) -> str:

@@ -87,6 +87,8 @@ def test_the_verdict_in_words_for_everybody(
     lines = "\n".join(plain_lines(Verdict(privacy, accuracy)))
     assert all(part in lines for part in said), lines
     assert ("was measured" in lines) == (privacy.status != "PASS")
+    assert "LFW's people" not in lines
+    assert "1 person in 7 to 1 in 12" in plain_lines(Verdict(privacy), strangers=True)[0]
 
 
 def test_what_more_photos_bring_stands_in_the_measurements() -> None:

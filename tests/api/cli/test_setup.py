@@ -231,6 +231,26 @@ def test_a_master_key_that_is_given_is_not_made(
     assert not file.exists()
 
 
+@pytest.mark.parametrize("secret", [False, True])
+def test_serve_finds_the_database_that_was_set_up_unless_its_url_is_secret(
+    world: World,
+    tmp_path: Path,
+    prepared: Callable[..., Ran],
+    monkeypatch: pytest.MonkeyPatch,
+    secret: bool,
+) -> None:
+    url = f"sqlite:///{tmp_path}/other.db"
+    if secret:
+        monkeypatch.setattr(command, "_keep_api_key", lambda *_: None)
+        url = "postgresql+psycopg://me:word@127.0.0.1:1/veilface"
+    monkeypatch.setenv("VEILFACE_DATABASE_URL", url)
+    ran = prepared("--pack", world.pack)
+    assert ran.status == 0, ran.stderr
+    assert "word" not in Path("veilface.toml").read_text()
+    assert ("database_url" in Path("veilface.toml").read_text()) != secret
+    assert ("in no file" in ran.stderr) == secret
+
+
 def test_settings_of_somebody_else_are_kept(
     world: World, data: Path, prepared: Callable[..., Ran]
 ) -> None:

@@ -1,4 +1,5 @@
 import os
+import shutil
 import subprocess
 import sys
 
@@ -54,9 +55,48 @@ def test_what_an_enrollment_may_replace(world, veilface):
     assert both.status == 2
 
 
+@pytest.mark.parametrize("listed", [False, True])
+def test_many_are_enrolled_and_who_is_not_is_named(world, veilface, tmp_path, listed):
+    people = tmp_path / "people"
+    shutil.copytree(world.people, people)
+    (people / "person-2" / "0.png").write_bytes(b"no picture")
+    shutil.copy(people / "person-1" / "0.png", people / "person-3" / "other.png")
+    source = people
+    if listed:
+        source = tmp_path / "people.csv"
+        photos = sorted(people.glob("*/*.png"))
+        lines = [f"{photo.parent.name},people/{photo.parent.name}/{photo.name}" for photo in photos]
+        source.write_text("\n".join(["subject,photo", *lines, "absent,no.jpg", ""]))
+    ran = veilface("enroll", "--from", source, "--pack", world.pack, "--json")
+    assert ran.status == 1, ran.stderr
+    assert ran.json["tenant"] == "default"
+    enrolled = {one["subject_id"]: one for one in ran.json["enrolled"]}
+    assert set(enrolled) == {"person-1", "person-4"}
+    assert {one["photos"] for one in enrolled.values()} == {5}
+    failed = {one["subject_id"]: one["message"] for one in ran.json["failed"]}
+    assert set(failed) == {"person-2", "person-3", *(["absent"] if listed else [])}
+    assert failed["person-2"].startswith("0.png: ")
+    assert failed["person-3"].startswith("other.png does not look like the person on 0.png")
+    accepted = veilface("verify", "person-4", *world.photos(4, range(3)), "--pack", world.pack)
+    assert accepted.status == 0, accepted.stderr
+
+    again = veilface("enroll", "--from", source, "--pack", world.pack, "--no-replace")
+    assert again.status == 1
+    assert "Enrolled 0 of " in again.stdout
+    assert "the subject is enrolled" in again.stdout
+
+
+def test_many_are_enrolled_and_all_is_well(world, veilface):
+    ran = veilface("enroll", "--from", world.people, "--pack", world.pack)
+    assert (ran.status, ran.stdout) == (0, "Enrolled 4 of 4 people, from 20 photos.\n"), ran.stderr
+
+
 def test_what_stands_in_the_way_is_named(world, veilface, tmp_path):
     broken = tmp_path / "broken.png"
     broken.write_bytes(b"no picture")
+    no_columns, no_value = tmp_path / "columns.csv", tmp_path / "value.csv"
+    no_columns.write_text("name\nann\n")
+    no_value.write_text("subject,photo\nann,\n")
     photo = world.photos(1, range(1))
     pack = ("--pack", world.pack)
     cases = [
@@ -66,6 +106,12 @@ def test_what_stands_in_the_way_is_named(world, veilface, tmp_path):
         (("enroll", "ann", *photo, *pack, "--tenant", "elsewhere"), 1, "no tenant"),
         (("enroll", "ann", *(photo * 11), *pack), 2, "1 to 10 photos"),
         (("enroll", "ann", *photo), 2, "--pack"),
+        (("enroll", "ann"), 2, "or many people with --from"),
+        (("enroll", "ann", *photo, "--from", tmp_path, *pack), 2, "no SUBJECT"),
+        (("enroll", "--from", tmp_path / "absent", *pack), 2, "neither a folder nor"),
+        (("enroll", "--from", tmp_path, *pack), 1, "no photo in a person's folder"),
+        (("enroll", "--from", no_columns, *pack), 2, "the columns subject,photo"),
+        (("enroll", "--from", no_value, *pack), 2, "line 2: a subject and a photo"),
     ]
     for arguments, status, said in cases:
         ran = veilface(*arguments)
