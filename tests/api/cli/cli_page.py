@@ -1,6 +1,7 @@
 """The generated part of ``docs/cli.md``. Write it anew: ``python -m tests.api.cli.cli_page``."""
 
 import re
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,9 @@ from api.cli.app import COMMANDS, load
 
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "cli.md"
 MARK = "<!-- Below, all is generated: python -m tests.api.cli.cli_page -->\n"
+HEAD = "| argument, option | meaning |\n|---|---|\n"
+SEVERAL = 3
+"""An option that means the same in so many commands is explained once."""
 
 
 def leaves(command: Any, *path: str) -> Iterator[tuple[tuple[str, ...], Any]]:
@@ -28,31 +32,50 @@ def all_commands() -> dict[tuple[str, ...], Any]:
 def page() -> str:
     """The whole page: what is written by hand, and a section for each command."""
     head = PAGE.read_text(encoding="utf-8").partition(MARK)[0]
-    return head + MARK + "".join(section(*each) for each in all_commands().items())
+    commands = all_commands()
+    counts = Counter(row for command in commands.values() for row in rows(command))
+    shared = {row for row, count in counts.items() if count >= SEVERAL}
+    table = "".join(sorted(row for row in shared))
+    return (
+        f"{head}{MARK}\n## Options of several commands\n\n{HEAD}{table}"
+        + "".join(section(*each, shared) for each in commands.items())
+    )
 
 
-def section(path: tuple[str, ...], command: Any) -> str:
-    """What a command is for, and a row for each argument and option."""
-    rows, settings = [], []
-    for parameter in command.params:
-        flags = [flag for flag in parameter.opts + parameter.secondary_opts if flag != "--help"]
-        if getattr(parameter, "rich_help_panel", None) == "Settings":
-            settings.append(f"`{flags[0]}`")
-        elif flags:
-            if parameter.param_type_name == "argument":
-                flags = [parameter.metavar or str(parameter.name).upper()]
-            default = parameter.default
-            shown = "" if default in (None, False, True, ()) else f" Default: `{default}`."
-            help_text = " ".join((parameter.help or "").split()).replace("|", "\\|")
-            rows.append(f"| {', '.join(f'`{flag}`' for flag in flags)} | {help_text}{shown} |\n")
+def rows(command: Any) -> list[str]:
+    """A row for each argument, and each option that is no setting."""
+    return [
+        f"| {', '.join(f'`{flag}`' for flag in flags)} | {meaning(parameter)} |\n"
+        for parameter in command.params
+        if getattr(parameter, "rich_help_panel", None) != "Settings"
+        and (flags := flags_of(parameter))
+    ]
+
+
+def flags_of(parameter: Any) -> list[str]:
+    if parameter.param_type_name == "argument":
+        return [parameter.metavar or str(parameter.name).upper()]
+    return [flag for flag in parameter.opts + parameter.secondary_opts if flag != "--help"]
+
+
+def meaning(parameter: Any) -> str:
+    """What the help says, and the default."""
+    default = parameter.default
+    shown = "" if default in (None, False, True, (), "") else f" Default: `{default}`."
+    return " ".join((parameter.help or "").split()).replace("|", "\\|") + shown
+
+
+def section(path: tuple[str, ...], command: Any, shared: set[str]) -> str:
+    """What a command is for, a row for each argument and option of its own, and the shared ones."""
     text, _, example = command.help.strip().partition("Example: ")
     calls = "\n".join(" ".join(call.split()) for call in re.findall(r"`(veilface[^`]+)`", example))
     text += f"```sh\n{calls}\n```"
-    if rows:
-        text += "\n\n| argument, option | meaning |\n|---|---|\n" + "".join(rows).rstrip("\n")
-    if settings:
-        shown = ", ".join(settings) if len(settings) < 20 else "all of [settings.md](settings.md)"
-        text += f"\n\nSettings as flags: {shown}."
+    own = [row for row in rows(command) if row not in shared]
+    also = [row.split("|")[1].strip() for row in rows(command) if row in shared]
+    if own:
+        text += f"\n\n{HEAD}" + "".join(own).rstrip("\n")
+    if also:
+        text += f"\n\nAlso {', '.join(also)}."
     return f"\n## `veilface {' '.join(path)}`\n\n{text}\n"
 
 
