@@ -35,11 +35,9 @@ def page() -> str:
     commands = all_commands()
     counts = Counter(row for command in commands.values() for row in rows(command))
     shared = {row for row, count in counts.items() if count >= SEVERAL}
-    table = "".join(sorted(row for row in shared))
-    return (
-        f"{head}{MARK}\n## Options of several commands\n\n{HEAD}{table}"
-        + "".join(section(*each, shared) for each in commands.items())
-    )
+    table = "".join(sorted(shared))
+    sections = "".join(section(*each, shared) for each in commands.items())
+    return f"{head}{MARK}\n## Options of several commands\n\n{HEAD}{table}{sections}"
 
 
 def rows(command: Any) -> list[str]:
