@@ -3,6 +3,7 @@
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -138,13 +139,25 @@ class Session:
         return [np.asarray(result) for result in results]
 
 
+@cache
+def _share_arena() -> None:
+    """Let the sessions of this process take their memory from one arena instead of one each."""
+    memory = ort.OrtMemoryInfo(
+        "Cpu", ort.OrtAllocatorType.ORT_ARENA_ALLOCATOR, 0, ort.OrtMemType.DEFAULT
+    )
+    defaults = -1
+    ort.create_and_register_allocator(memory, ort.OrtArenaCfg(0, defaults, defaults, defaults))
+
+
 def _load(model: bytes, name: str, providers: list[str], threads: int | None) -> Any:
     options = ort.SessionOptions()
     options.log_severity_level = _LOG_ERRORS_ONLY
     # Memory patterns are kept for every input shape ever seen, and photos have many shapes.
-    # The arena stays: it levels off at the largest canvas and batch, which are bounded
-    # (docs/models.md has the measurement).
+    # One arena for all sessions levels off at the largest canvas and batch, which are bounded
+    # (docs/results/photos.md has the measurement).
     options.enable_mem_pattern = False
+    _share_arena()
+    options.add_session_config_entry("session.use_env_allocators", "1")
     if threads is not None:
         options.intra_op_num_threads = threads
         options.inter_op_num_threads = 1
@@ -162,6 +175,8 @@ def _load(model: bytes, name: str, providers: list[str], threads: int | None) ->
             f" in another file, convert it to a single one. onnxruntime says: {error}"
         ) from error
     session.disable_fallback()
+    # It keeps the bytes to load them again elsewhere, which is switched off.
+    vars(session).pop("_model_bytes", None)
     running = session.get_providers()
     missing = [provider for provider in providers if provider not in running]
     if missing:
