@@ -3,7 +3,7 @@
 import signal
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from typing import Annotated
 
 import typer
@@ -13,11 +13,10 @@ from api.cli.errors import CommandError
 from api.cli.options import takes_settings
 from api.cli.verdict import private_mode_weakness, verdict_lines
 from api.limits.rates import RateLimits
-from api.service.opening import key_beside_database, require_privacy
+from api.service.opening import Deployment, key_beside_database, require_privacy
 from api.service.runtime import Runtime
 from api.service.server import listen, run_server, tls_options
 from api.settings import Settings
-from templates.contract.document import Contract
 from templates.decoys import DecoyGenerator
 
 
@@ -38,11 +37,7 @@ def serve(
 
     Example: `veilface serve --pack buffalo_l --data-dir veilface-data --workers 2`
     """
-    with _ended_by_sigterm():
-        contract = _check(settings)
-        binding = contract.binding
-        if demo_notice(binding.embedder_sha256, n=binding.n) and not settings.demo:
-            settings = settings.model_copy(update={"demo": True})
+    with _ended_by_sigterm(), _opened(settings, check=check) as deployment:
         if check:
             say("Everything fits together: contract, decoys, pack, database and master key.")
             return
@@ -50,7 +45,7 @@ def serve(
             port = listener.getsockname()[1]
             message(f"Veilface listens on {service_url(settings, port=port)}")
             try:
-                run_server(settings, contract, listener)
+                run_server(deployment, listener)
             except SystemExit as error:
                 if error.code:
                     raise CommandError("the service did not start; its log says why") from None
@@ -73,22 +68,29 @@ def service_url(settings: Settings, *, port: int | None = None) -> str:
     return f"{scheme}://{host}:{port or settings.port}"
 
 
-def _check(settings: Settings) -> Contract:
-    """Open everything, models included, say what an operator should know, and close it again."""
+@contextmanager
+def _opened(settings: Settings, *, check: bool) -> Iterator[Deployment]:
+    """Open what is served for the block, and say what an operator should know of it.
+
+    Several workers open the models themselves, and this process weighs less without any.
+    """
     tls_options(settings)
     RateLimits.open(settings)
-    runtime = Runtime.open(settings)
-    if warning := key_beside_database(settings):
-        message(f"warning: {warning}")
-    try:
-        for line in verdict_lines(runtime.contract.verdict):
+    answers = check or settings.workers == 1
+    deployment = (Runtime if answers else Deployment).open(settings)
+    with closing(deployment):
+        contract = deployment.contract
+        binding = contract.binding
+        if demo_notice(binding.embedder_sha256, n=binding.n):
+            deployment.settings = settings.model_copy(update={"demo": True})
+        if warning := key_beside_database(settings):
+            message(f"warning: {warning}")
+        for line in verdict_lines(contract.verdict):
             message(line)
-        require_privacy(runtime.contract, settings)
-        browsers_lift = settings.serve_pack and isinstance(runtime.source, DecoyGenerator)
-        if browsers_lift and (weakness := private_mode_weakness(runtime.contract)) is not None:
+        require_privacy(contract, settings)
+        browsers_lift = settings.serve_pack and isinstance(deployment.source, DecoyGenerator)
+        if browsers_lift and (weakness := private_mode_weakness(contract)) is not None:
             message(f"warning: private mode: {weakness}")
-        if not runtime.store.api_keys.all():
+        if not deployment.store.api_keys.all():
             message("there is no API key yet: `veilface keys create --out FILE` makes one")
-        return runtime.contract
-    finally:
-        runtime.close()
+        yield deployment

@@ -173,6 +173,7 @@ def _document() -> dict[str, Any]:
 def _lift_cohort(nobody: Nobody) -> None:
     try:
         _ = nobody.cohort
+        give_back()
     except Exception as error:
         # The next lifted probe tries again.
         log("cohort not lifted", severity=logging.ERROR, error_type=type(error).__name__)

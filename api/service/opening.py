@@ -6,8 +6,10 @@ what is wrong with it, and what to do.
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 from sqlalchemy import inspect, select
@@ -51,6 +53,54 @@ def database_in_use(url: str) -> bool:
         return database.read(marked)
     finally:
         database.close()
+
+
+@dataclass(eq=False)
+class Deployment:
+    """What the files and the database of a deployment hold, without models.
+
+    Attributes
+    ----------
+    settings
+        What named them.
+    keyring
+        The master keys.
+    store, contract, source
+        The database, at this program's schema; the contract; the decoys of its axes.
+    """
+
+    settings: Settings
+    keyring: MasterKeyring
+    store: TemplateStore
+    contract: Contract
+    source: DecoyPool | DecoyGenerator
+
+    @classmethod
+    def open(cls, settings: Settings, *, contract: Contract | None = None) -> Self:
+        """Open what the settings name.
+
+        Parameters
+        ----------
+        settings
+            What is opened.
+        contract
+            The settings' contract, if it is open already.
+
+        Raises
+        ------
+        StartError
+            One sentence on the first thing that is wrong.
+        """
+        keyring = open_keyring(settings)
+        contract = contract or open_contract(settings, keyring)
+        source = open_decoys(settings, keyring, contract)
+        store = open_store(settings, keyring)
+        prepare_database(store)
+        return cls(settings, keyring, store, contract, source)
+
+    def close(self) -> None:
+        """Let go of the database's connections."""
+        self.store.close()
 
 
 def file_sealer(keyring: MasterKeyring) -> KeyringSealer:

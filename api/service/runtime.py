@@ -12,19 +12,16 @@ import contextlib
 import threading
 from collections import OrderedDict
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, Self
 
 from api.http.errors import ApiError
 from api.http.policy import Levels, LivenessRules
 from api.http.transfer import Exported, ExportKey, seal_export
 from api.service.opening import (
-    file_sealer,
+    Deployment,
     open_contract,
-    open_decoys,
     open_keyring,
     open_pack,
-    open_store,
-    prepare_database,
     try_inference,
 )
 from api.service.served_graphs import served_graphs
@@ -36,29 +33,14 @@ from models.decoding import ImageLimits
 from models.pack import ModelPack
 from templates.contract import wire
 from templates.contract.document import Contract
-from templates.decoys import DecoyGenerator, DecoyPool
 from templates.errors import StoreBusy
 from templates.keys.rotation import TenantRotation
-from templates.keys.sealing import MasterKeyring
-from templates.store import TemplateStore
 from templates.store.audit_log import By
 from templates.store.secrets import SecretName
 from templates.store.subject_rows import Source, SubjectTemplate
 from templates.store.subjects import Precondition, StoredTemplate
 from templates.store.tenants import RetiredRotation
 from verify import Verifier
-
-__all__ = [
-    "Runtime",
-    "file_sealer",
-    "open_contract",
-    "open_decoys",
-    "open_keyring",
-    "open_pack",
-    "open_store",
-    "prepare_database",
-    "try_inference",
-]
 
 READS = 3
 """Looks at a template whose rotation key may be dropped between the looks at the two."""
@@ -86,14 +68,9 @@ class InRotation:
 
 
 @dataclass(eq=False)
-class Runtime:
+class Runtime(Deployment):
     """Everything that answers a request, opened once in each process."""
 
-    settings: Settings
-    keyring: MasterKeyring
-    store: TemplateStore
-    contract: Contract
-    source: DecoyPool | DecoyGenerator
     pack: ModelPack | None
     operators_export_key: ExportKey | None
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
@@ -111,32 +88,16 @@ class Runtime:
         )
 
     @classmethod
-    def open(cls, settings: Settings, *, contract: Contract | None = None) -> "Runtime":
-        """Open everything that the settings name, and run one inference where there is a pack.
-
-        Parameters
-        ----------
-        settings
-            What is opened.
-        contract
-            The settings' contract, if it is open already.
-
-        Raises
-        ------
-        StartError
-            One sentence on the first thing that is wrong.
-        """
-        keyring = open_keyring(settings)
-        contract = contract or open_contract(settings, keyring)
-        source = open_decoys(settings, keyring, contract)
+    def open(cls, settings: Settings, *, contract: Contract | None = None) -> Self:
+        """Open what the settings name, the pack before the database, and run one inference."""
+        contract = contract or open_contract(settings, open_keyring(settings))
         pack = open_pack(settings, contract)
         if pack is not None:
             try_inference(pack)
-        store = open_store(settings, keyring)
-        prepare_database(store)
         file = settings.export_key_file
         export_key = None if file is None else ExportKey.from_file(file)
-        return cls(settings, keyring, store, contract, source, pack, export_key)
+        opened = Deployment.open(settings, contract=contract)
+        return cls(**vars(opened), pack=pack, operators_export_key=export_key)
 
     @property
     def export_key(self) -> ExportKey:
@@ -301,7 +262,3 @@ class Runtime:
         template_id = template.record.template_id
         self.store.subjects.record_export(tenant, subject, template_id=template_id, by=by)
         return seal_export(exported, key=self.export_key, contract_id=contract_id, tenant=tenant)
-
-    def close(self) -> None:
-        """Let go of the database's connections."""
-        self.store.close()

@@ -23,6 +23,7 @@ from api.http.errors import DatabaseAway, StartError
 from api.http.protocol import Protocol
 from api.service.logging import configure, log, uvicorn_log_config
 from api.service.metrics import shared_directory
+from api.service.opening import Deployment
 from api.service.runtime import Runtime
 from api.settings import NO_PROXIES, Settings
 from templates.contract.document import Contract
@@ -38,15 +39,15 @@ CIPHERS = "ECDHE+AESGCM:ECDHE+CHACHA20"
 """Of TLS 1.2: forward secrecy and authenticated encryption. Those of TLS 1.3 are all like that."""
 
 
-def run_server(settings: Settings, contract: Contract, listener: socket.socket) -> None:
+def run_server(deployment: Deployment, listener: socket.socket) -> None:
     """Serve until told to stop.
 
     Parameters
     ----------
-    settings
-        What is served, and by how many workers.
-    contract
-        The one that the settings name: a worker in place of one that died serves the same.
+    deployment
+        What is served. One worker, this process, answers with this :class:`Runtime` and closes it.
+        Several open their own of the same settings and contract, also one in place of one that
+        died.
     listener
         The socket to take connections from.
 
@@ -55,8 +56,9 @@ def run_server(settings: Settings, contract: Contract, listener: socket.socket) 
     SystemExit
         With a status other than 0 where the service, or one of its workers, could not start.
     """
-    config = uvicorn.Config(**uvicorn_options(settings, contract))
-    if settings.workers == 1:
+    settings = deployment.settings
+    config = uvicorn.Config(**uvicorn_options(deployment))
+    if isinstance(deployment, Runtime):
         server = uvicorn.Server(config)
         with contextlib.suppress(KeyboardInterrupt):
             server.run([listener])
@@ -101,14 +103,13 @@ class _Worker(multiprocess.Process):
 multiprocess.Process = _Worker  # type: ignore[misc]
 
 
-def _application(settings: Settings, contract: Contract) -> FastAPI:
+def _worker_app(settings: Settings, contract: Contract) -> FastAPI:
     """Make a worker's application; the worker ends with the process that started it.
 
     It would hold the port otherwise, and a service that is started again could not listen.
     """
     parent = multiprocessing.parent_process()
-    if parent is None:
-        return create_app(settings, open_runtime=partial(Runtime.open, contract=contract))
+    assert parent is not None  # noqa: S101 - uvicorn starts workers as processes
     threading.Thread(target=_end_after, args=(parent,), daemon=True).start()
     stopping = threading.Event()
     handle = signal.getsignal(signal.SIGTERM)
@@ -149,10 +150,15 @@ def _end_after(parent: multiprocessing.process.BaseProcess) -> None:
     signal.raise_signal(signal.SIGTERM)
 
 
-def uvicorn_options(settings: Settings, contract: Contract) -> dict[str, Any]:
+def uvicorn_options(deployment: Deployment) -> dict[str, Any]:
     """Return the keyword arguments of ``uvicorn.Config``."""
+    settings = deployment.settings
+    if isinstance(deployment, Runtime):
+        app = partial(create_app, settings, open_runtime=lambda _: deployment)
+    else:
+        app = partial(_worker_app, settings, deployment.contract)
     return {
-        "app": partial(_application, settings, contract),
+        "app": app,
         "factory": True,
         "workers": settings.workers,
         "log_config": uvicorn_log_config("warning" if settings.log_level == "info" else "info"),

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 from PIL import Image
 
-from api.service.runtime import (
+from api.service.opening import (
     file_sealer,
     open_keyring,
     open_store,

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 import sqlalchemy as sa
 
-from api.service.runtime import open_keyring, open_store
+from api.service.opening import open_keyring, open_store
 from templates.contract import wire
 from templates.errors import VeilfaceError
 from templates.store import TemplateStore

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from api.http.requests import LONGEST_S
 from api.http.tokens import new_token
-from api.service.runtime import open_keyring, open_store
+from api.service.opening import open_keyring, open_store
 from models.pack import ModelPack
 from tests.api.deployment import Deployment, bearer, images, photo
 from tests.patience import PATIENCE_S

@@ -14,7 +14,7 @@ import pytest
 import sqlalchemy as sa
 
 from api.http.app import create_app
-from api.service.runtime import open_keyring, open_store
+from api.service.opening import open_keyring, open_store
 from templates.store import TemplateStore
 from tests.api.client import Client
 from tests.api.deployment import Deployment, deploy

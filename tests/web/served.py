@@ -12,7 +12,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from api.service.runtime import open_keyring, open_store
+from api.service.opening import open_keyring, open_store
 from api.settings import Settings
 from templates.store.api_keys import Right
 from tests.patience import PATIENCE_S

@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from api.cli import app
-from api.service.runtime import file_sealer
+from api.service.opening import file_sealer
 from models.demo import build_demo_pack
 from models.synthetic import draw_face, encode_photo
 from templates.contract.document import Contract

@@ -1,6 +1,6 @@
 import pytest
 
-from api.service.runtime import open_keyring, open_store
+from api.service.opening import open_keyring, open_store
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, images, photo
 from tests.api.shapes import assert_error

@@ -6,7 +6,7 @@ import numpy as np
 
 from api.http.app import create_app
 from api.http.schemas import ContractAnswer, HealthAnswer
-from api.service.runtime import file_sealer, open_keyring
+from api.service.opening import file_sealer, open_keyring
 from models.pack import ModelPack
 from templates.decoys import DecoyGenerator, DecoyPool
 from templates.keys.randomness import Keystream

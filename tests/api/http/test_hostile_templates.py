@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from api.http.app import create_app
 from api.http.schemas import EnrollmentAnswer
-from api.service.runtime import file_sealer, open_keyring
+from api.service.opening import file_sealer, open_keyring
 from attacks.stored.wolves import canonical
 from models.pack import ModelPack
 from templates.contract import wire

@@ -3,7 +3,7 @@
 from datetime import UTC, datetime, timedelta
 
 from api.http.schemas import KeyAnswer
-from api.service.runtime import open_keyring, open_store
+from api.service.opening import open_keyring, open_store
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer
 from tests.api.shapes import assert_answer, assert_error

@@ -24,6 +24,7 @@ from api.http.errors import ApiError, StartError
 from api.limits import rates
 from api.limits.rates import RateLimits, address_of
 from api.service.metrics import RATE_LIMITED, RATE_STORAGE_FAILURES
+from api.service.runtime import Runtime
 from api.service.server import uvicorn_options
 from api.settings import Settings, load_settings
 from tests.api.deployment import Deployment, bearer, deploy
@@ -387,7 +388,7 @@ def test_forwarded_addresses_are_believed_from_proxies_only(
     settings = tight.settings.model_copy(update={"trusted_proxies": trusted})
 
     async def scenario() -> None:
-        options = uvicorn_options(settings, tight.contract)
+        options = uvicorn_options(Runtime.open(settings))
         app = options["app"]()
         config = uvicorn.Config(**{**options, "app": app, "factory": False, "log_config": None})
         config.load()
