@@ -43,20 +43,17 @@ def verify(
     anchor: Annotated[
         str | None,
         typer.Option(
-            help="What `audit-log head` wrote earlier, or a file with it. With it, a log that was "
-            "put back to an older state, head and all, is found too."
+            help="What `audit-log head` wrote earlier, or a file with it: also finds a log that "
+            "was put back to an older state, head and all."
         ),
     ] = None,
 ) -> Result:
     """Check the audit log, and keys and lockouts against it; exit status 1 if anything is wrong.
 
-    Names the first line that was altered, removed, added or moved. Where the log is whole, names
-    API keys that were made up, altered or put back after they ended, enrollments and tenants that
-    were put back, settings of tenants that were changed, and counts of failed attempts that were
-    lowered. What the lines of an archive tell is not looked at.
-
-    Needs: the database and its master key: an attacker who can write the database but has no
-    master key can write no line. The service may run meanwhile.
+    Needs: the database and its master key; the service may run meanwhile. Names the first line that
+    was altered, removed, added or moved. If the log is whole, names API keys that were made up,
+    altered or put back, enrollments and tenants that were put back, settings of tenants that were
+    changed, and counts of failed attempts that were lowered. Lines in an archive are not used.
 
     Example: `veilface audit-log verify --anchor head.txt`
     """
@@ -143,8 +140,8 @@ def _archived(archived: Archive, sentence: str) -> Result:
 def head(*, settings: Settings) -> Result:
     """Print the number and MAC of the last line, to be kept elsewhere.
 
-    Keep it where the database administrator cannot write: `verify --anchor` then detects a log that
-    was rolled back to an earlier state.
+    Keep it where the database's administrator cannot write: `verify --anchor` then finds a log that
+    was put back to an earlier state.
 
     Example: `veilface audit-log head > head.txt`
     """

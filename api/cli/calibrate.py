@@ -44,9 +44,8 @@ def calibrate(
     folder: Annotated[
         Path | None,
         typer.Argument(
-            help="Labelled faces: one subfolder for each person, with photos in it (as LFW has "
-            "them). Or faces that nobody labelled, in no subfolder: each photo is taken for "
-            "another person. Not with --liveness."
+            help="Labelled faces: one subfolder for each person, as in LFW. Or faces that nobody "
+            "labelled, in no subfolder: each photo counts as another person. Not with --liveness."
         ),
     ] = None,
     *,
@@ -69,8 +68,8 @@ def calibrate(
         typer.Option(
             min=1,
             max=MAX_M,
-            help="Dimension m of stored templates. Unset: with --axes, what rejects the fewest "
-            "genuine probes of all that is private.",
+            help="Dimension m of stored templates. Unset: chosen with --axes, so that templates "
+            "are private and the fewest genuine probes are rejected.",
         ),
     ] = None,
     axes: Annotated[
@@ -129,8 +128,8 @@ def calibrate(
         bool,
         typer.Option(
             "--worst-group",
-            help="Set every level of a target so that the FMR exceeds it in no group either, of "
-            "those with trials enough to set a threshold by.",
+            help="Set every level so that the FMR keeps its target within each group, too, if the "
+            "group has enough trials.",
         ),
     ] = False,
     photos: Annotated[

@@ -91,11 +91,10 @@ def current(*, settings: Settings) -> Result:
 def compact(*, settings: Settings) -> Result:
     """Rewrite the database files, so that no page keeps erased data.
 
-    On PostgreSQL this is `VACUUM (FULL)` of the tables that hold subject data: remains of erased
-    rows go, and each table is locked meanwhile. SQLite overwrites what is erased at once; there
-    this is `VACUUM`, which gives free space back. PostgreSQL needs free disk as large as the data,
-    SQLite free memory (nothing temporary goes to disk). Both make writes wait: run it when few
-    requests come.
+    On PostgreSQL this is `VACUUM (FULL)` of the tables that hold subject data, which removes what
+    is left of erased rows and needs free disk as large as the data. On SQLite, which overwrites
+    erased rows at once, it is `VACUUM`, which gives free space back and needs as much free memory.
+    Writes wait meanwhile: run it when few requests come.
 
     Example: `veilface db compact --data-dir veilface-data`
     """
@@ -119,8 +118,8 @@ def unlock(
 ) -> Result:
     """Clear the failed attempts of a subject; exit status 1 if there are none.
 
-    Use it to re-enable a subject that was disabled after many failures. Make sure first that it was
-    the subject who failed.
+    It re-enables a subject that was disabled after many failures. Make sure first that it was the
+    subject who failed.
 
     Example: `veilface db unlock alice --tenant default`
     """
@@ -180,11 +179,10 @@ def template_enrollment(
 ) -> Result:
     """Allow or forbid a tenant's clients to enroll templates that they made themselves.
 
-    Forbidden unless you allow it. Nothing in a template tells whether it holds one person: whoever
-    has a key with `enroll` and `embeddings` can lay one template through as many people as it has
-    dimensions, and the service accepts all of them as that subject. Allow it only if you would
-    trust the holders of such keys to say who somebody is. It takes effect at once, in all workers;
-    stored templates stay. Importing an export needs no permission: the service sealed it.
+    Forbidden by default. A template does not show how many people it holds: with a key for `enroll`
+    and `embeddings` one can enroll a template that accepts as many people as it has dimensions.
+    Allow it only if you trust the holders of such keys to say who somebody is. It takes effect at
+    once, in all workers; stored templates stay. An import needs no permission.
 
     Example: `veilface db template-enrollment --tenant default --allow`
     """

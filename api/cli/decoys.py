@@ -50,8 +50,8 @@ def build(
     like: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Folder of some photos, 300 or more, of the kind that will be enrolled, of other "
-            "people than those: the decoys are spread as those are. May be given several times."
+            help="Folder of 300 photos or more of the kind of people who will be enrolled, but of "
+            "other people: the decoys are adapted to them. May be given several times."
         ),
     ] = None,
     out: Annotated[

@@ -222,13 +222,11 @@ def rotate_tenant(
 ) -> Result:
     """Give a tenant a new rotation key, and turn its stored templates by it.
 
-    Nobody has to enroll again, and the service may run meanwhile; the old key is dropped at the
-    end. That is enough if only that key may have leaked. A
-    stolen template stays a credential whatever happens to ours: with `--stolen`, only people
-    enrolled from now on get the new key; the others are listed, and verified as before until they
-    enroll again with new photos. Run it with `--stolen --finish` to see who is left, and again when
-    nobody is: `--finish` alone would turn the stolen templates too. Needs: the database, the key
-    file and the contract.
+    Needs: the database, the key file and the contract; the service may run meanwhile. Nobody has
+    to enroll again, and the old key is dropped at the end. That is enough if only this key leaked.
+    If templates were stolen too, use `--stolen`: stored templates keep their old key, and the
+    people who must enroll again, with new photos, are listed. `--stolen --finish` shows who is
+    left, and drops the old key when nobody is; `--finish` alone would turn the stolen templates.
 
     Example: `veilface keys rotate-tenant --tenant default`
     """
@@ -276,9 +274,8 @@ def verify_receipt(
 ) -> Result:
     """Verify an erasure receipt; exit status 1 if it is not valid.
 
-    Needs no service and no other key: take `GET /v1/contract` once, which names the public key, and
-    keep it with the receipts. After `keys renew` a receipt from before is no longer valid: a second
-    DELETE answers with one under the new key.
+    Needs no service: keep `GET /v1/contract`, which names the public key, with the receipts. After
+    `keys renew` an earlier receipt is no longer valid; a second DELETE answers with a new one.
 
     Example: `veilface keys verify-receipt receipt.json --public-key contract.json`
     """

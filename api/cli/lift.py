@@ -85,11 +85,11 @@ def lift(
 ) -> Result:
     """Make a private template from photos on this machine, without any secret of the service.
 
-    Needs: the service's model pack, `GET /v1/contract` and `GET /v1/contract/generator` saved to
-    files. Send the result as `{"template": …}`; the key needs the right `embeddings`, and to enroll
-    it the tenant must allow templates (`veilface db template-enrollment`). Several photos of one
-    person are averaged before they are lifted. Never lift the same photo twice for enrollment: two
-    templates of one embedding give it away.
+    Needs: the service's model pack, and `GET /v1/contract` and `GET /v1/contract/generator` saved
+    to files. Send the result as `{"template": …}` with a key that has the right `embeddings`; to
+    enroll it, the tenant must allow templates (`veilface db template-enrollment`). Several photos
+    of one person are averaged. Never lift the same photo twice for an enrollment: two templates of
+    one embedding give it away. Keep the file like a password.
 
     Example: `veilface lift me-1.jpg me-2.jpg --pack buffalo_l --generator generator.bin
     --contract contract.json --out me.veil`

@@ -88,10 +88,10 @@ def renew(
     """Renew every secret of the deployment, after its database and master key were stolen.
 
     Stop the service first, and start it again afterwards. Puts a new master key in force and drops
-    the old one; moves the audit log into a signed archive and begins a new chain; draws the keys of
-    receipts, exports and API keys anew, and every tenant's rotation key. Then lists what is left to
-    people: who enrolls again, and which API keys are replaced. Master keys that do not come from a
-    file: put a new one in front where they come from first, and drop the old one afterwards.
+    the old one; moves the audit log into a signed archive; renews the keys of receipts, exports,
+    API keys and the audit log, and every tenant's rotation key. Then lists who must enroll again,
+    and which API keys to replace. If the master keys do not come from a file, put a new one in
+    front at their source first, and drop the old one afterwards.
 
     Example: `veilface keys renew audit-before-theft.jsonl`
     """

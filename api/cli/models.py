@@ -72,9 +72,9 @@ def fetch(
 ) -> Result:
     """Fetch a pack from an address that you name, and check that it can be used.
 
-    Shows licence and size first, and the SHA-256 of what came. Veilface keeps no addresses of
-    weights: take one from the owner of the pack. Only `.onnx` files and `pack.toml` are taken out
-    of an archive. Exit status 1: it cannot be fetched or used, and nothing is left of it.
+    Shows licence and size first, then the SHA-256. Veilface has no addresses of weights: take one
+    from the owner of the pack. Of an archive only `.onnx` files and `pack.toml` are unpacked. Exit
+    status 1: the pack cannot be fetched or used, and nothing of it is left.
 
     Example: `veilface models fetch buffalo_sc --from https://example.org/buffalo_sc.zip`
     """
