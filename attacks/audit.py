@@ -264,7 +264,7 @@ def _settings(
     return {
         "victims": plan.victims,
         "decoy_owners": plan.owners,
-        "attacker_faces": len(population.others) + sum(len(more.descriptors) for more in beside),
+        "attacker_faces": len(_known(population, beside, with_owners=True)[0]),
         "calibration_people": len(set(population.names)),
         "calibration": "of the people" if plan.contract is None else "of the contract",
         "contract_id": None if plan.contract is None else plan.contract.contract_id,

@@ -1,13 +1,15 @@
-"""The report of an audit in Markdown; reads nothing but the document."""
+"""The report of an audit for a reader: its verdict as tables, and all of it in Markdown.
 
-from collections.abc import Iterable, Mapping, Sequence
+Both read nothing but the document.
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
-from attacks.outcomes import KnowledgeLevel, Leaked, Property, Scheme
+from attacks.outcomes import Property, Scheme
 from attacks.report import RESULTS
 from attacks.verdict import LIMITS, NOTHING_JUDGED
 from verify.evaluation.markdown_cells import (
-    MISSING,
     count,
     fixed,
     interval_cell,
@@ -18,103 +20,133 @@ from verify.evaluation.markdown_cells import (
 )
 
 Row = Mapping[str, Any]
-_KNOWLEDGE = {
-    KnowledgeLevel.TEMPLATE: "template only",
-    KnowledgeLevel.ALGORITHM: "+ algorithm",
-    KnowledgeLevel.DECOYS: "+ decoys",
-    KnowledgeLevel.RIGHT: "+ right",
-    KnowledgeLevel.TEMPLATES: "k templates",
+Columns = Mapping[str, Callable[[Row], object]]
+"""By title: what stands in the cell of a row."""
+
+
+def _attack(row: Row) -> str:
+    return f"{row['attack']} ({row['variant']})" if row["variant"] else str(row["attack"])
+
+
+def _scheme(row: Row) -> str:
+    return plain(Scheme.of(row))
+
+
+VERDICT: Columns = {
+    "property": lambda cell: cell["property"],
+    "leaked": lambda cell: cell["leaked"],
+    "attacker has": lambda cell: cell["knowledge"],
+    "strongest attack": _attack,
+    "reached (95 %)": lambda cell: (
+        f"{cell['value']:.3g} ({cell['ci_low']:.2g}-{cell['ci_high']:.2g})"
+    ),
+    "by chance": lambda cell: f"{cell['chance']:.3g}",
+    "compared": lambda cell: f"{cell['compared']:.3g}",
+    "limit": lambda cell: "" if cell["most"] >= 1 else f"{cell['limit']} {cell['most']:.3g}",
+    "status": lambda cell: cell["status"],
 }
-_LEAKED = {
-    Leaked.DATABASE: "nothing, or the database only",
-    Leaked.MASTER_KEY: "+ master key; the holder keeps a key",
-    Leaked.HOLDER_KEYS: "+ holder's key; or + master key, where no holder keeps one",
+_ATTRIBUTES: Columns = {
+    "scheme": _scheme,
+    "attacker": lambda row: plain(
+        row["attacker"] + (f", {row['metric']}" if row["metric"] else "")
+    ),
+    "knows": lambda row: plain(row["knowledge"]),
+    "accuracy %": lambda row: interval_cell(
+        {**row, "value": row["accuracy"], "errors": row["correct"]}
+    ),
+    "balanced %": lambda row: percent(row["balanced_accuracy"]),
+    "chance %": lambda row: percent(row["chance"]),
+    "leakage": lambda row: plain(row["leakage"]),
+}
+_LEVELS: Columns = {
+    "scheme": _scheme,
+    "level": lambda row: (
+        plain(row["name"]) + (" (default)" if row["name"] == row["default_level"] else "")
+    ),
+    "FMR %": lambda row: _share(row["fmr"]),
+    "FNMR %": lambda row: _share(row["fnmr"]),
+    "template, bytes": lambda row: count(row["template_bytes"]),
+}
+_OUTCOMES: Columns = {
+    "attack": lambda row: plain(row["attack"] + (f": {row['variant']}" if row["variant"] else "")),
+    "leaked": lambda row: plain(row["leaked"]),
+    "knows": lambda row: plain(row["knowledge"]),
+    "level": lambda row: plain(row["level"]),
+    "success": lambda row: _measured(row["measured"]),
+    "chance": lambda row: significant(row["chance"]),
+    "AUC": lambda row: fixed(row["details"].get("auc"), 3),
+    "cosine to truth": lambda row: fixed(row["details"].get("cosine_to_truth_mean"), 3),
+    "judged": lambda row: "yes" if row["judged"] else f"no: {plain(row['unjudged'])}",
+}
+_LIMITS: Columns = {
+    "limit": lambda limit: f"`--max-{limit['name']}`",
+    "most": lambda limit: significant(limit["most"]),
+    "on": lambda limit: limit["meaning"],
 }
 
 
-def markdown(report: Mapping[str, Any]) -> str:
+def markdown(report: Row) -> str:
     """Return the whole report."""
     parts = [
         f"# Privacy audit: {plain(report['kind'])}",
         _result(report),
         *_verdicts(report),
         *_attributes(report["rows"]),
-        *_operating(report),
+        *_levels(report.get("schemes", ())),
         *_outcomes(report["outcomes"]),
         _settings(report),
     ]
-    return "\n\n".join(part for part in parts if part) + "\n"
+    return "\n\n".join(parts) + "\n"
+
+
+def verdict_tables(report: Row) -> Iterable[tuple[str, list[list[str]]]]:
+    """Yield title and cells of the table of each scheme, which has the columns of ``VERDICT``."""
+    for verdict in report["verdicts"]:
+        compared = ", for comparison" if verdict["comparison"] else ""
+        title = f"Verdict on {Scheme.of(verdict)}{compared}"
+        yield title, _cells(verdict["cells"], VERDICT)
+
+
+def _cells(rows: Iterable[Row], columns: Columns) -> list[list[str]]:
+    return [[str(cell(row)) for cell in columns.values()] for row in rows]
+
+
+def _table(rows: Iterable[Row], columns: Columns) -> str:
+    return table(list(columns), _cells(rows, columns), [True] * len(columns))
 
 
 def _result(report: Row) -> str:
-    lines = [f"**{RESULTS[report['passed']]}**"]
+    lines = [f"**{RESULTS[report['passed']]}**", ""]
     lines += [f"- {plain(sentence)}" for sentence in report["headlines"]]
     if report["comparison_headlines"]:
         lines += ["", "For comparison only:", ""]
         lines += [f"- {plain(sentence)}" for sentence in report["comparison_headlines"]]
-    return "\n".join([lines[0], "", *lines[1:]])
+    return "\n".join(lines)
 
 
 def _verdicts(report: Row) -> Iterable[str]:
     yield "## Verdict"
     yield (
-        "Each cell is the strongest attack that was made: its measure with the 95 % interval, what "
-        "guessing would reach, and how it stands against the limit. *Not shown*: the sample is too "
-        "small, so that the upper bound exceeds twice the limit. Where a cell is empty, no attack "
-        "of ours fits it. The columns say what leaked."
+        "A row is the strongest attack that was made on a property after a theft: its measure with "
+        "the 95 % interval, what guessing would reach, and how it stands against the limit. *Not "
+        "shown*: the sample is too small, so that the upper bound exceeds twice the limit. The "
+        "database alone holds ciphertext only: no attack begins there, and what stands in its rows "
+        "uses the service."
     )
-    yield (
-        "The database alone holds ciphertext only: no attack begins there, and what stands in its "
-        "column uses the service."
-    )
-    for verdict in report["verdicts"]:
-        cells: dict[tuple[str, str], dict[str, list[str]]] = {}
-        for cell in verdict["cells"]:
-            line = cells.setdefault((cell["property"], cell["knowledge"]), {})
-            line.setdefault(cell["leaked"], []).append(_verdict_cell(cell))
-        lines = [
-            [
-                str(prop),
-                _KNOWLEDGE[known],
-                *("<br>".join(cells[prop, known].get(leaked, [MISSING])) for leaked in Leaked),
-            ]
-            for prop in Property
-            for known in KnowledgeLevel
-            if (prop, known) in cells
-        ]
-        title = f"### {plain(str(Scheme.of(verdict)))}"
-        if verdict["comparison"]:
-            title += " (comparison)"
-        yield title
-        if not lines:
+    for title, cells in verdict_tables(report):
+        yield f"### {plain(title)}"
+        if not cells:
             yield f"On this scheme {NOTHING_JUDGED}."
             continue
-        yield table(
-            ["property", "attacker has", *(_LEAKED[leaked] for leaked in Leaked)],
-            lines,
-            [True] * (2 + len(Leaked)),
-        )
+        lines = [[plain(cell) for cell in line] for line in cells]
+        yield table(list(VERDICT), lines, [True] * len(VERDICT))
     yield "### Limits"
-    yield table(
-        ["limit", "most", "on"],
-        [
-            [f"`--max-{limit.name}`", significant(report["limits"][limit.name]), limit.meaning]
+    yield _table(
+        (
+            {"name": limit.name, "meaning": limit.meaning, "most": report["limits"][limit.name]}
             for limit in LIMITS
-        ],
-        [True, False, True],
-    )
-
-
-def _verdict_cell(cell: Row) -> str:
-    name = plain(cell["attack"]) + (f" ({plain(cell['variant'])})" if cell["variant"] else "")
-    status = cell["status"]
-    shown = f"**{status}**" if status == "fail" else status
-    if cell["reason"]:
-        why = "by design" if status == "no limit" else "cannot hold"
-        shown += f", {why}: {plain(cell['reason'])}"
-    return (
-        f"{significant(cell['value'])} [{significant(cell['ci_low'])}, "
-        f"{significant(cell['ci_high'])}], chance {significant(cell['chance'])}: {name}: {shown}"
+        ),
+        _LIMITS,
     )
 
 
@@ -130,41 +162,16 @@ def _attributes(rows: Sequence[Row]) -> Iterable[str]:
     for attribute in dict.fromkeys(str(row["attribute"]) for row in rows):
         of_attribute = [row for row in rows if row["attribute"] == attribute]
         yield f"### {plain(attribute)}"
-        first = of_attribute[0]
         stated = ", ".join(
             f"{plain(name)} {percent(value)}"
-            for name, value in first["baselines"].items()
+            for name, value in of_attribute[0]["baselines"].items()
             if name != "same_predictions"  # of this row's attacker only
         )
         yield f"Baselines in %: {stated}."
-        yield table(
-            [
-                "scheme",
-                "attacker",
-                "knows",
-                "accuracy %",
-                "balanced %",
-                "chance %",
-                "leakage",
-            ],
-            [
-                [
-                    plain(str(Scheme.of(row))),
-                    plain(row["attacker"] + (f", {row['metric']}" if row.get("metric") else "")),
-                    plain(row["knowledge"]),
-                    interval_cell({**row, "value": row["accuracy"], "errors": row["correct"]}),
-                    percent(row["balanced_accuracy"]),
-                    percent(row["chance"]),
-                    plain(row["leakage"]),
-                ]
-                for row in of_attribute
-            ],
-            [True, True, True, False, False, False, True],
-        )
+        yield _table(of_attribute, _ATTRIBUTES)
 
 
-def _operating(report: Row) -> Iterable[str]:
-    schemes = report.get("schemes")
+def _levels(schemes: Sequence[Row]) -> Iterable[str]:
     if not schemes:
         return
     yield "## What each scheme costs"
@@ -172,31 +179,15 @@ def _operating(report: Row) -> Iterable[str]:
         "Error rates of the calibration at each level, both tests together, in % with the 95 % "
         "interval; a raw photo is compared with a template of one or more averaged photos."
     )
-    yield table(
-        ["scheme", "level", "FMR %", "FNMR %", "template, bytes"],
-        [
-            [
-                plain(str(Scheme.of(scheme))),
-                plain(level["name"])
-                + (" (default)" if level["name"] == scheme["default_level"] else ""),
-                interval_cell({**level["fmr"], "value": _share(level["fmr"])}),
-                interval_cell({**level["fnmr"], "value": _share(level["fnmr"])}),
-                count(scheme["template_bytes"]),
-            ]
-            for scheme in schemes
-            for level in scheme["levels"]
-        ],
-        [True, True, False, False, False],
-    )
+    yield _table(({**scheme, **level} for scheme in schemes for level in scheme["levels"]), _LEVELS)
 
 
-def _share(rate: Row) -> float:
-    return float(rate["errors"]) / rate["trials"] if rate["trials"] else 0.0
+def _share(rate: Row) -> str:
+    value = float(rate["errors"]) / rate["trials"] if rate["trials"] else 0.0
+    return interval_cell({**rate, "value": value})
 
 
 def _outcomes(outcomes: Sequence[Row]) -> Iterable[str]:
-    if not outcomes:
-        return
     shown = [row for row in outcomes if row["property"] != Property.CONFIDENTIALITY]
     if not shown:
         return
@@ -206,50 +197,19 @@ def _outcomes(outcomes: Sequence[Row]) -> Iterable[str]:
         "counts, at the level named; D_sys is no share, and is given as it is. AUC: how often a "
         "guess is nearer to a photo of its own person than of another; 0.5 tells nothing."
     )
-    for scheme in dict.fromkeys(Scheme.of(row) for row in shown):
-        yield f"### {plain(str(scheme))}: attacks"
-        yield table(
-            [
-                "attack",
-                "leaked",
-                "knows",
-                "level",
-                "success",
-                "chance",
-                "AUC",
-                "cosine to truth",
-                "judged",
-            ],
-            [
-                [
-                    plain(row["attack"] + (f": {row['variant']}" if row["variant"] else "")),
-                    plain(row["leaked"]),
-                    plain(row["knowledge"]),
-                    plain(row["level"]),
-                    _measured(row),
-                    significant(row["chance"]),
-                    fixed(row["details"].get("auc"), 3),
-                    fixed(row["details"].get("cosine_to_truth_mean"), 3),
-                    "yes" if row["judged"] else f"no: {plain(row['unjudged'])}",
-                ]
-                for row in shown
-                if Scheme.of(row) == scheme
-            ],
-            [True, True, True, True, False, False, False, False, True],
-        )
+    for scheme in dict.fromkeys(map(_scheme, shown)):
+        yield f"### {scheme}: attacks"
+        yield _table((row for row in shown if _scheme(row) == scheme), _OUTCOMES)
     yield "### What each attacker has and does"
     said = dict.fromkeys((row["attack"], row["assumption"]) for row in shown)
     yield "\n".join(f"- **{plain(name)}**: {plain(text)}" for name, text in said)
 
 
-def _measured(row: Row) -> str:
-    measured = row["measured"]
+def _measured(measured: Row) -> str:
     if "errors" in measured:
         return interval_cell(measured)
-    return (
-        f"{fixed(measured['value'], 3)} [{fixed(measured['ci_low'], 3)}, "
-        f"{fixed(measured['ci_high'], 3)}]"
-    )
+    value, low, high = (fixed(measured[name], 3) for name in ("value", "ci_low", "ci_high"))
+    return f"{value} [{low}, {high}]"
 
 
 def _acquired(failed: Row) -> str:

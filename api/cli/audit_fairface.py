@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from api.cli.audit_report import Out, Seed, conclude, model_json, share_once_begun, takes_limits
+from api.cli.audit_report import Out, Seed, model_json, reported, share_once_begun, takes_limits
 from api.cli.console import message
 from api.cli.descriptors import BULK, Aligned, Cache, Flip, bulk_pack, extract
 from api.cli.errors import UsageError, require_extra
@@ -14,13 +14,11 @@ from api.cli.inputs import fairface_labels, listed_dims, listed_names, load_deco
 from api.cli.options import (
     DEFAULT_DIM,
     PROCESSOR,
-    AsJson,
     Device,
     chosen_device,
     quick,
-    takes_settings,
 )
-from api.cli.results import Plan
+from api.cli.results import Plan, Result, reports
 from api.service.opening import file_sealer, open_keyring
 from api.settings import Settings
 from attacks.attributes.audit import (
@@ -53,7 +51,7 @@ STRATEGIES = (
 ATTACKERS = (KNN, LOGISTIC)
 
 
-@takes_settings(*BULK)
+@reports(*BULK)
 @takes_limits("attribute-leakage")
 def fairface(
     root: Annotated[
@@ -144,8 +142,7 @@ def fairface(
         bool, quick(lifting=300, attack=700, attacked=300, dim="4,16", generated_dim="16,64")
     ] = False,
     _plan: Plan = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Result:
     """Infer gender, race and age from templates: the paper's experiment, and stronger attackers.
 
     Writes report.json, report.md, figures, the paper's among them, and report.html, which has all
@@ -227,7 +224,7 @@ def fairface(
             "val": acquired_json(photos[1]),
         },
     )
-    conclude(report, out, pack, as_json=as_json)
+    return reported(report, out, pack)
 
 
 def _deployed(

@@ -9,14 +9,13 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import typer
-from rich.table import Table
 
-from api.cli.console import demo_notice, emit, say, share_done, show, table
+from api.cli.console import demo_notice, share_done
 from api.cli.errors import FAILED
 from api.cli.html_report import write_html
-from attacks.outcomes import Scheme
+from api.cli.results import Result, Table
 from attacks.report import RESULTS, Document
-from attacks.report_tables import markdown
+from attacks.report_tables import VERDICT, markdown, verdict_tables
 from attacks.verdict import LIMITS
 from models.pack import ModelPack
 from templates.keys.private_file import replace_public
@@ -112,50 +111,20 @@ def model_json(pack: ModelPack) -> dict[str, Any]:
     return {**recorded_of(pack), "embedder_sha256": pack.info.embedder_sha256}
 
 
-def conclude(report: Document, out: Path, pack: ModelPack, *, as_json: bool) -> None:
-    """Write the report, say first how it ended; leave with status 1 or 3 where it did not pass."""
+def reported(report: Document, out: Path, pack: ModelPack) -> Result:
+    """Write the report, and say first how it ended; status 1 or 3 where it did not pass."""
     notice = demo_notice(pack.info.embedder_sha256, n=pack.info.n)
-    files = write_report(report, out)
-    if as_json:
-        emit({**notice, "out": str(out), "files": [path.name for path in files], **report})
-    else:
-        say(RESULTS[report["passed"]])
-        for sentence in report["headlines"]:
-            say(sentence)
-        for sentence in report["comparison_headlines"]:
-            say(f"For comparison: {sentence}")
-        show(*verdict_tables(report))
-        say(f"{out}: {', '.join(path.name for path in files)}.")
-        say(f"To read it: {out / 'report.html'}")
-    if not report["passed"]:
-        raise typer.Exit(NOT_SHOWN if report["passed"] is None else FAILED)
-
-
-def verdict_tables(report: Document) -> list[Table]:
-    """Show how the strongest attacks stand against the limits; one table for each scheme."""
-    made = []
-    for verdict in report["verdicts"]:
-        if not verdict["cells"]:  # a line above says so
-            continue
-        title = f"Verdict on {Scheme.of(verdict)}" + (
-            ", for comparison" if verdict["comparison"] else ""
-        )
-        listing = table(
-            title, "property", "leaked", "attacker has", "strongest attack", "reached (95 %)",
-            "by chance", "compared", "limit", "",
-        )  # fmt: skip
-        for cell in verdict["cells"]:
-            variant = f" ({cell['variant']})" if cell["variant"] else ""
-            listing.add_row(
-                cell["property"],
-                cell["leaked"],
-                cell["knowledge"],
-                f"{cell['attack']}{variant}",
-                f"{cell['value']:.3g} ({cell['ci_low']:.2g}-{cell['ci_high']:.2g})",
-                f"{cell['chance']:.3g}",
-                f"{cell['compared']:.3g}",
-                "" if cell["most"] >= 1 else f"{cell['limit']} {cell['most']:.3g}",
-                cell["status"],
-            )
-        made.append(listing)
-    return made
+    files = [path.name for path in write_report(report, out)]
+    tables = [Table(title, list(VERDICT), cells) for title, cells in verdict_tables(report)]
+    return Result(
+        {**notice, "out": str(out), "files": files, **report},
+        [
+            RESULTS[report["passed"]],
+            *report["headlines"],
+            *(f"For comparison: {sentence}" for sentence in report["comparison_headlines"]),
+            *(one for one in tables if one.rows),  # a line above says so of the others
+            f"{out}: {', '.join(files)}.",
+            f"To read it: {out / 'report.html'}",
+        ],
+        status={True: 0, False: FAILED, None: NOT_SHOWN}[report["passed"]],
+    )

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from api.cli.audit_report import Out, Seed, conclude, model_json, share_once_begun, takes_limits
+from api.cli.audit_report import Out, Seed, model_json, reported, share_once_begun, takes_limits
 from api.cli.console import message
 from api.cli.descriptors import BULK, Aligned, Cache, Flip, bulk_pack, extract
 from api.cli.errors import UsageError, require_extra
@@ -15,13 +15,11 @@ from api.cli.inputs import further_faces, listed_dims, load_decoys
 from api.cli.options import (
     DEFAULT_DIM,
     PROCESSOR,
-    AsJson,
     Device,
     chosen_device,
     quick,
-    takes_settings,
 )
-from api.cli.results import Plan
+from api.cli.results import Plan, Result, reports
 from api.service.opening import file_sealer, open_keyring
 from api.settings import Settings
 from attacks.audit import AuditPlan, run_audit
@@ -39,7 +37,7 @@ from verify import labelled_folder
 from verify.preparation import acquired_json
 
 
-@takes_settings(*BULK)
+@reports(*BULK)
 @takes_limits(
     "foot-point-success",
     "recovery-success",
@@ -156,8 +154,7 @@ def templates(
         bool, quick(victims=50, owners=100, climbed=2, attempts=200, training_seconds=20)
     ] = False,
     _plan: Plan = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Result:
     """Attack private templates: inversion, linkage, renewal, impersonation, climbing.
 
     Writes report.json, report.md, figures and report.html, which has all to read in one file, to
@@ -248,7 +245,7 @@ def templates(
         schemes=result.schemes,
         failure_to_acquire=acquired_json(faces),
     )
-    conclude(report, out, pack, as_json=as_json)
+    return reported(report, out, pack)
 
 
 def _served(settings: Settings, sealer: Sealer, source: DecoySource | None) -> Binding | None:

@@ -58,8 +58,6 @@ def row(attacker: str, accuracy: float) -> dict[str, Any]:
         "ci_high": accuracy + 0.03,
         "balanced_accuracy": accuracy,
         "chance": 0.529,
-        "mutual_information_bits": 0.012,
-        "mutual_information_null": {"mean": 0.001, "percentile_95": 0.003},
         "baselines": {"uniform": 0.5, "majority": 0.529, "prior": 0.502},
         "leakage": "above",
     }
@@ -137,7 +135,7 @@ def test_the_markdown_begins_with_the_result_and_shows_every_attack() -> None:
     assert "0.090 [0.060, 0.120]" in text
     assert "61.00 [58.00, 64.00] (610/1000)" in text
     assert "Two rotated templates &#124; of two tenants." in text
-    assert "(comparison)" in text
+    assert ", for comparison" in text
     assert "Baselines in %: uniform 50.00, majority 52.90, prior 50.20." in text
 
 

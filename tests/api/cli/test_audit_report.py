@@ -8,7 +8,8 @@ from typing import Any, cast
 import pytest
 import typer
 
-from api.cli.audit_report import conclude
+from api.cli.audit_report import reported
+from api.cli.results import present
 from attacks.outcomes import AttackOutcome, KnowledgeLevel, Leaked, Property, Scheme
 from attacks.report import document
 from models.pack import ModelPack
@@ -30,7 +31,7 @@ def row(**more: Any) -> AttackOutcome:
 def concluded(*rows: AttackOutcome, out: Path) -> None:
     report = document("templates", outcomes=rows, limits={}, model={}, settings={})
     pack = SimpleNamespace(info=SimpleNamespace(embedder_sha256="ab" * 32, n=64))
-    conclude(report, out, cast(ModelPack, pack), as_json=False)
+    present(reported(report, out, cast(ModelPack, pack)), json=False)
 
 
 DRAWING = row(attack="drawing", measured=rate(60, 100), unjudged="people are drawn")
