@@ -65,16 +65,13 @@ def service(folder: Path, **settings: Any) -> Iterator[tuple[Server, Deployment]
             **settings,
         },
     )
-    server = Server(deployment, folder)
-    try:
-        server.wait()
+    with Server(deployment, folder) as server:
         with httpx.Client(
             base_url=server.url, headers=bearer(deployment.token), timeout=PATIENCE_S
         ) as client:
             answer = client.put("/v1/subjects/alice/enrollment", files=images(photo(1)))
             assert answer.status_code == 201, answer.text
         yield server, deployment
-    finally:
         server.stop()
 
 

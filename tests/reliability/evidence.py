@@ -2,8 +2,11 @@
 
 Three records are compared with each other: the answers, the audit log and the tables. No
 acknowledged write may be missing in the other two, and nothing may be there that nobody asked for.
+The order of the audit log must be a serial order: one that explains every answer, as if all calls
+had come one after the other.
 """
 
+import math
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
@@ -20,9 +23,7 @@ from templates.store.audit_log import Line
 from templates.store.receipts import Receipt, verify_receipt
 from templates.store.schema import ReceiptRow, SubjectRow, TemplateRow
 from tests.api.deployment import Deployment, M, N
-from tests.reliability.linearizability import SearchTooLong
 from tests.reliability.operations import Operation
-from tests.reliability.register import call_of, explain
 
 DECIDED = ("accept", "reject")
 ENROLLED = {True: "replaced", False: "created"}
@@ -71,6 +72,29 @@ def examine(asked: Asked, subjects: Sequence[str]) -> Examined:
         store.close()
 
 
+@dataclass
+class _Left:
+    """What a write has left, and the moments between which it may have been seen.
+
+    Attributes
+    ----------
+    since
+        When the write was sent; ``until`` is when the next one was over.
+    """
+
+    since: float
+    enrolled: Operation | None
+    until: float = math.inf
+
+    def is_seen_as(self, template_id: str | None, told: set[str | None]) -> bool:
+        """Whether a description of it shows this template; None where nobody is enrolled."""
+        if self.enrolled is None or template_id is None:
+            return self.enrolled is None and template_id is None
+        if self.enrolled.template_id is None:  # nobody was answered which
+            return template_id not in told
+        return template_id == self.enrolled.template_id
+
+
 class _Examination:
     def __init__(
         self,
@@ -86,6 +110,7 @@ class _Examination:
         self.replays = asked.replays
         self.violations: list[str] = []
         self.lines = list(store.audit_log.lines())
+        self.sent = {each.request_id: each for each in self.history}
         self.by_request: dict[str, list[Line]] = defaultdict(list)
         for line in self.lines:
             if line.request_id is not None:
@@ -144,12 +169,8 @@ class _Examination:
 
     def _lines_follow_the_clock(self) -> None:
         """A line is written between request and answer: the log's order is a serial order."""
-        sent = {each.request_id: each for each in self.history}
         latest = -1.0
-        for line in self.lines:
-            each = sent.get(line.request_id or "")
-            if each is None:
-                continue
+        for each in self._operations(self.lines):
             if each.over < latest:
                 self._wrong(f"audit log: the line of {each} stands too late")
             latest = max(latest, each.started)
@@ -254,31 +275,72 @@ class _Examination:
             self._wrong(f"{subject}: failed attempts are {counts}, by the audit log {counted}")
 
     def _serial(self, subject: str) -> None:
-        calls = []
-        for each in self.history:
-            effective = bool(self.by_request.get(each.request_id))
-            unsure = each.writes and each.may_have_happened and effective
-            if each.subject == subject and (each.answered_well or unsure):
-                calls.append(call_of(each, effective=effective))
-        try:
-            order = explain(calls)
-        except SearchTooLong as error:
-            self._wrong(f"{subject}: no verdict: {error}")
-            return
-        if order is None:
-            self._wrong(f"{subject}: no serial order explains its {len(calls)} answers")
+        """In the log's order, each answer on a subject is what the calls before it had left.
+
+        A verification of person Y is accepted if and only if Y is enrolled (the lockout is off). A
+        repeated erasure gives the receipt of the last one.
+        """
+        enrolled: Operation | None = None
+        receipt: str | None = None
+        known = True  # the receipt: not where its erasure had no answer
+        left = [_Left(-math.inf, None)]
+        for each in self._operations(self._lines_of(subject)):
+            well = each.answered_well
+            if each.kind == "verify":
+                person = None if enrolled is None else enrolled.person
+                if well and each.accepted != (person == each.person):
+                    self._wrong(f"{subject}: no serial order: {each}")
+                continue
+            before = receipt
+            if each.kind == "erase" and enrolled is None and (before is not None or not known):
+                if well and known and each.receipt_id != before:
+                    self._wrong(f"{subject}: no serial order: {each}")
+                continue
+            if each.kind == "erase":
+                if well and (each.receipt_id == before or each.held != (enrolled is not None)):
+                    self._wrong(f"{subject}: no serial order: {each}")
+                enrolled, receipt, known = None, each.receipt_id if well else None, well
+            else:
+                enrolled = each
+            left[-1].until = each.over
+            left.append(_Left(max(left[-1].since, each.started), enrolled))
+        self._described(subject, left)
+
+    def _described(self, subject: str, left: Sequence["_Left"]) -> None:
+        """A description, which has no line, saw what was left at a moment of its own.
+
+        One that was sent after another one's answer saw the same, or something later.
+        """
+        enrollments = [each for each in self.history if each.kind == "enroll"]
+        told = {each.template_id for each in enrollments if each.answered_well}
+        seen: list[tuple[float, int]] = []
+        for each in sorted(self.history, key=lambda one: one.started):
+            if each.kind != "describe" or each.subject != subject or not each.answered_well:
+                continue
+            first = max((place for answered, place in seen if answered < each.started), default=0)
+            places = [
+                place
+                for place, one in enumerate(left)
+                if place >= first
+                and one.since <= each.answered
+                and one.until >= each.started
+                and one.is_seen_as(each.template_id, told)
+            ]
+            if not places:
+                self._wrong(f"{subject}: no serial order: {each}")
+                continue
+            seen.append((each.answered, places[0]))
+
+    def _operations(self, lines: Sequence[Line]) -> list[Operation]:
+        """The clients' operations of some lines, in the order of these."""
+        return [self.sent[line.request_id or ""] for line in lines if line.request_id in self.sent]
 
     def _lines_of(self, subject: str) -> list[Line]:
         pseudonym = self.store.signer.pseudonym(self.tenant, subject)
         return [line for line in self.lines if line.pseudonym == pseudonym]
 
     def _writes_of(self, subject: str) -> list[Operation]:
-        sent = {each.request_id: each for each in self.history if each.writes}
-        return [
-            sent[line.request_id or ""]
-            for line in self._lines_of(subject)
-            if line.request_id in sent and line.action in ("enroll", "erase")
-        ]
+        return [each for each in self._operations(self._lines_of(subject)) if each.writes]
 
     def _scalar(self, query: Any) -> Any:
         return self.store.database.read(lambda each: each.execute(query).scalar())

@@ -16,13 +16,13 @@ from typing import Any, Protocol
 import httpx
 
 from tests.api.deployment import deploy
+from tests.api.server_process import Server
 from tests.patience import PATIENCE_S
 from tests.ports import free_port
 from tests.reliability.evidence import examine, unexpected
 from tests.reliability.kill import QUIET
 from tests.reliability.load import Load, look_at_all, make_subjects, people_of
 from tests.reliability.operations import Clients, Operation, People
-from tests.reliability.service import Service
 
 MOUNT_BYTES = 4 * 1024 * 1024
 FILE_LIMIT_BYTES = 12 * 1024
@@ -31,9 +31,9 @@ FILE_LIMIT_BYTES = 12 * 1024
 class Shortage(Protocol):
     """A way to take the database's space away, and to give it back."""
 
-    def take(self, service: Service) -> None: ...
+    def take(self, service: Server) -> None: ...
 
-    def give_back(self, service: Service) -> None: ...
+    def give_back(self, service: Server) -> None: ...
 
 
 class FullFileSystem:
@@ -47,14 +47,14 @@ class FullFileSystem:
         self._held = threading.Event()
         self._keeper: threading.Thread | None = None
 
-    def take(self, service: Service) -> None:
+    def take(self, service: Server) -> None:
         self._filler.touch()
         self._fill()
         self._held.set()
         self._keeper = threading.Thread(target=self._keep)
         self._keeper.start()
 
-    def give_back(self, service: Service) -> None:
+    def give_back(self, service: Server) -> None:
         self._held.clear()
         if self._keeper is not None:
             self._keeper.join()
@@ -77,12 +77,12 @@ class FullFileSystem:
 class FileSizeLimit:
     """Lets no file of the workers grow: EFBIG, for any user, on any file system."""
 
-    def take(self, service: Service) -> None:
+    def take(self, service: Server) -> None:
         for pid in service.workers():
             _, hard = resource.prlimit(pid, resource.RLIMIT_FSIZE)
             resource.prlimit(pid, resource.RLIMIT_FSIZE, (FILE_LIMIT_BYTES, hard))
 
-    def give_back(self, service: Service) -> None:
+    def give_back(self, service: Server) -> None:
         for pid in service.workers():
             _, hard = resource.prlimit(pid, resource.RLIMIT_FSIZE)
             resource.prlimit(pid, resource.RLIMIT_FSIZE, (hard, hard))
@@ -142,7 +142,7 @@ def full_disk_run(
         **{**QUIET, "purge_interval_s": 1},
     )
     people = People(deployment, people_of(subjects))
-    with Service(deployment, folder) as service:
+    with Server(deployment, folder) as service:
         clients, workers = Clients(service, people), sorted(service.workers())
         with Load(clients, subjects, writers=4, readers=2, seed=seed) as load:
             for _ in range(rounds):
@@ -183,7 +183,7 @@ def _round(shortage: Shortage, clients: Clients, short_s: float, report: FullDis
     _await_ready(service, freed, report)
 
 
-def _await_ready(service: Service, freed: float, report: FullDiskReport) -> None:
+def _await_ready(service: Server, freed: float, report: FullDiskReport) -> None:
     """Every worker must get ready by itself; a fresh connection asks either of them."""
     in_a_row = 0
     while in_a_row < 10:
@@ -227,7 +227,7 @@ def _one_at_a_time(shortage: Shortage, clients: Clients, report: FullDiskReport)
 
 
 @contextmanager
-def _short(shortage: Shortage, service: Service) -> Iterator[None]:
+def _short(shortage: Shortage, service: Server) -> Iterator[None]:
     shortage.take(service)
     try:
         yield

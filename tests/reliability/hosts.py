@@ -15,12 +15,12 @@ from pathlib import Path
 from typing import Any
 
 from tests.api.deployment import Deployment, deploy
+from tests.api.server_process import ROOT, Server
 from tests.ports import free_port
 from tests.privileges import not_permitted
 from tests.redis_server import own_redis_server
 from tests.reliability.cluster import Cluster
 from tests.reliability.kill import QUIET
-from tests.reliability.service import ROOT, Service
 
 BRIDGE = "bridge"
 PREFIX = "198.18.0"
@@ -126,7 +126,7 @@ class Host:
         self.address = network.address_of(number)
         settings = shared.settings.model_copy(update={"host": self.address})
         deployment = replace(shared, settings=settings)
-        self.service = Service(deployment, folder, within=network.within(number))
+        self.service = Server(deployment, folder, within=network.within(number))
 
     def cut_off(self) -> None:
         self._network.cut_off(self._number)
@@ -139,7 +139,7 @@ class Host:
         asked = subprocess.run(
             [*self.service.within, sys.executable, "-m", "veilface.healthcheck"],
             cwd=ROOT,
-            env=self.service.environment(),
+            env=self.service.environment,
             stderr=subprocess.DEVNULL,
         )
         return asked.returncode == 0

@@ -1,7 +1,9 @@
 """SIGKILL of a worker, and of the whole service, at random moments of enrollments and erasures."""
 
 import math
+import os
 import random
+import signal
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
@@ -9,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from tests.api.deployment import deploy
+from tests.api.server_process import Server
 from tests.ports import free_port
 from tests.reliability.evidence import examine, unexpected
 from tests.reliability.load import Load, look_at_all, make_subjects, people_of
 from tests.reliability.operations import LOST, NOT_SENT, Clients, Operation, People
-from tests.reliability.service import Service
 
 WORKERS = 2
 WRITERS = 5
@@ -86,7 +88,7 @@ def kill_run(
     deployment = deploy(folder, database_url=database_url, port=free_port(), **QUIET)
     people = People(deployment, people_of(subjects))
     moments = sorted(draw.sample(range(2, operations - 1), kills))
-    with Service(deployment, folder) as service:
+    with Server(deployment, folder) as service:
         clients = Clients(service, people)
         with Load(clients, subjects, writers=WRITERS, readers=READERS, seed=seed) as load:
             for number, moment in enumerate(moments):
@@ -109,7 +111,7 @@ def kill_run(
 
 
 def _kill(
-    service: Service,
+    service: Server,
     clients: Clients,
     report: KillReport,
     draw: random.Random,
@@ -118,7 +120,7 @@ def _kill(
 ) -> None:
     workers = service.workers()
     if not of_service and workers:
-        service.kill_worker(draw.choice(workers))
+        os.kill(draw.choice(workers), signal.SIGKILL)
         report.kills_of_workers += 1
         return
     service.kill()

@@ -18,8 +18,8 @@ from api.http.tokens import new_token
 from api.service.opening import open_keyring, open_store
 from models.pack import ModelPack
 from tests.api.deployment import Deployment, bearer, images, photo
+from tests.api.server_process import Server
 from tests.patience import PATIENCE_S
-from tests.reliability.service import Service
 
 Kind = Literal["enroll", "erase", "verify", "describe", "contract"]
 
@@ -167,7 +167,7 @@ class Clients:
     Every request opens a connection, so that any worker may get it.
     """
 
-    def __init__(self, service: Service, people: People) -> None:
+    def __init__(self, service: Server, people: People) -> None:
         self.service = service
         self.tokens = Tokens(service.deployment)
         self.history: list[Operation] = []

@@ -11,6 +11,7 @@ from typing import Any
 import httpx
 
 from tests.api.deployment import deploy
+from tests.api.server_process import Server
 from tests.patience import PATIENCE_S, wait_until
 from tests.ports import free_port
 from tests.reliability.cluster import Cluster
@@ -18,7 +19,6 @@ from tests.reliability.evidence import examine, unexpected
 from tests.reliability.kill import QUIET
 from tests.reliability.load import Load, look_at_all, make_subjects, people_of
 from tests.reliability.operations import Clients, Operation, People
-from tests.reliability.service import Service
 
 WRITERS = 5
 READERS = 3
@@ -93,7 +93,7 @@ def outage_run(
     subjects = make_subjects(8)
     deployment = deploy(folder, database_url=cluster.url, port=free_port(), **QUIET)
     people = People(deployment, people_of(subjects))
-    with Service(deployment, folder) as service:
+    with Server(deployment, folder) as service:
         clients, workers = Clients(service, people), sorted(service.workers())
         with (
             Load(clients, subjects, writers=WRITERS, readers=READERS, seed=seed) as load,

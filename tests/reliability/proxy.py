@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 from cryptography import x509
 
+from tests.api.server_process import ROOT
 from tests.certificates import self_signed
 from tests.patience import PATIENCE_S, wait_until
 from tests.ports import free_port
-from tests.reliability.service import ROOT
 
 PAGE = (ROOT / "docs" / "deploy.md").read_text(encoding="utf-8")
 NAME = "faces.example.org"

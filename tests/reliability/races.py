@@ -13,12 +13,12 @@ from typing import Any
 import psutil
 
 from tests.api.deployment import deploy
+from tests.api.server_process import Server
 from tests.ports import free_port
 from tests.reliability.evidence import examine, unexpected
 from tests.reliability.kill import QUIET
 from tests.reliability.load import look_at_all, make_subjects, people_of
 from tests.reliability.operations import Clients, Operation, People
-from tests.reliability.service import Service
 
 CLIENTS = 32
 SUBJECTS = 5
@@ -65,7 +65,7 @@ def race_run(
     subjects = make_subjects(SUBJECTS)
     deployment = deploy(folder, database_url=database_url, port=free_port(), **QUIET)
     people = People(deployment, people_of(subjects))
-    with Service(deployment, folder) as service:
+    with Server(deployment, folder) as service:
         clients = Clients(service, people)
 
         def client(number: int) -> None:
@@ -101,7 +101,7 @@ def lockout_run(
         **{**QUIET, "lockout_after": after, "lockout_first_s": 3600, "compute_slots": 4},
     )
     people = People(deployment, [1, 2])
-    with Service(deployment, folder) as service:
+    with Server(deployment, folder) as service:
         clients = Clients(service, people)
         with _BothWork(service, report.violations):
             for number in range(subjects):
@@ -167,7 +167,7 @@ def _at_once(work: Callable[[int], object], count: int) -> None:
 class _BothWork:
     """Requires that both workers computed within the block."""
 
-    def __init__(self, service: Service, violations: list[str]) -> None:
+    def __init__(self, service: Server, violations: list[str]) -> None:
         self._workers = [psutil.Process(pid) for pid in service.workers()]
         self._violations = violations
 

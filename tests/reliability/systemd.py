@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 
+from tests.api.server_process import ROOT
 from tests.patience import PATIENCE_S, wait_until
 from tests.privileges import not_permitted
-from tests.reliability.service import ROOT
 
 SYSTEMD = shutil.which("systemd", path="/usr/lib/systemd:/lib/systemd")
 PATH = "PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"

@@ -18,11 +18,11 @@ from api.service.opening import open_keyring, open_store
 from templates.store import TemplateStore
 from tests.api.client import Client
 from tests.api.deployment import Deployment, deploy
+from tests.api.server_process import Server
 from tests.reliability.evidence import examine, unexpected
 from tests.reliability.kill import QUIET
 from tests.reliability.load import look_at_all, make_subjects, people_of
 from tests.reliability.operations import LOST, NOT_SENT, Clients, Operation, People
-from tests.reliability.service import Service
 
 SUBJECTS = make_subjects(2)
 
@@ -31,7 +31,7 @@ class InProcess(Clients):
     """Clients of an application in this process."""
 
     def __init__(self, client: Client, deployment: Deployment, people: People) -> None:
-        super().__init__(cast(Service, SimpleNamespace(deployment=deployment)), people)
+        super().__init__(cast(Server, SimpleNamespace(deployment=deployment)), people)
         self._application = client
 
     def _client(self) -> Any:

@@ -16,9 +16,9 @@ from api.service.runtime import Runtime
 from templates.store import Source
 from templates.store.audit_log import By
 from tests.api.deployment import Deployment, bearer, deploy, images, photo
+from tests.api.server_process import ROOT, Server
 from tests.patience import PATIENCE_S
 from tests.ports import free_port
-from tests.reliability.service import ROOT, Service
 
 pytestmark = pytest.mark.long
 
@@ -46,7 +46,7 @@ main()
 class Verifications(threading.Thread):
     """Verifies every subject in turn, with a photo of its own and one of another person."""
 
-    def __init__(self, service: Service) -> None:
+    def __init__(self, service: Server) -> None:
         super().__init__(daemon=True)
         self._service = service
         self._ended = threading.Event()
@@ -147,7 +147,7 @@ def test_a_running_service_is_moved_by_one_command_killed_ten_times(
         runtime.close()
     store = open_store(deployment.settings, open_keyring(deployment.settings))
     try:
-        with Service(deployment, tmp_path) as service:
+        with Server(deployment, tmp_path) as service:
             clients = [Verifications(service) for _ in range(2)]
             for client in clients:
                 client.start()

@@ -11,10 +11,10 @@ import httpx
 import pytest
 
 from tests.api.deployment import bearer, deploy, images, photo
+from tests.api.server_process import ROOT
 from tests.pages import block_under
 from tests.patience import PATIENCE_S, wait_until
 from tests.reliability.hosts import Network
-from tests.reliability.service import ROOT
 from tests.reliability.systemd import Machine
 
 pytestmark = pytest.mark.long

@@ -80,7 +80,7 @@ def exhausted_key(first: Host, second: Host) -> str:
     """A key that is used up on both hosts, after exactly as many requests as it may make."""
 
     def outages() -> int:
-        logs = (*first.service.log, *second.service.log)
+        logs = (*first.service.lines(), *second.service.lines())
         return sum(line.get("event") == "rate limit storage failed" for line in logs)
 
     for _ in range(20):
@@ -245,7 +245,7 @@ class ThroughProxy:
 
 def verifications(host: Host) -> int:
     """How many reached a host."""
-    return sum(line.get("route", "").endswith("/verify") for line in host.service.log)
+    return sum(line.get("route", "").endswith("/verify") for line in host.service.lines())
 
 
 def test_nginx_leads_to_both_hosts_and_repeats_no_verification(
@@ -298,4 +298,4 @@ def test_nginx_leads_to_both_hosts_and_repeats_no_verification(
         for subject in itertools.islice(itertools.cycle(PEOPLE), 12):
             assert client.verify(subject).json()["decision"] == "accept"
         wait_until(lambda: verifications(other) >= before[other] + 12)
-        assert KILLED not in [line.get("request_id") for line in other.service.log]
+        assert KILLED not in [line.get("request_id") for line in other.service.lines()]

@@ -20,11 +20,11 @@ import pytest
 
 from api.service.opening import open_keyring, open_store
 from tests.api.deployment import Deployment, deploy
+from tests.api.server_process import ROOT, Server
 from tests.patience import PATIENCE_S, wait_until
 from tests.ports import free_port
 from tests.reliability.kill import QUIET
 from tests.reliability.operations import Clients, Operation, People
-from tests.reliability.service import ROOT, Service
 from tests.reliability.switch import Switch
 
 PAGE = (ROOT / "docs" / "deploy.md").read_text(encoding="utf-8")
@@ -258,13 +258,13 @@ def test_no_request_fails_during_an_upgrade(
     old_port, new_port = deployment.settings.port, free_port()
     drill = Drill(tmp_path, old_port, new_port)
     people = People(deployment, list(PEOPLE.values()))
-    with Switch(old_port) as switch, Service(deployment, tmp_path) as old:
+    with Switch(old_port) as switch, Server(deployment, tmp_path) as old:
         clients = Clients(Front(switch.url, deployment), people)
         assert all(clients.enroll(*each).outcome == 201 for each in PEOPLE.items())
         try:
             with Requests(clients) as requests, told(switch, tmp_path, old_port):
                 requests.wait_for_more()
-                done = drill.run(old.process.pid, old.environment())
+                done = drill.run(old.process.pid, old.environment)
                 assert done.returncode == 0, done.stdout
                 assert old.process.wait(timeout=PATIENCE_S) == 0, old.tail()
                 requests.wait_for_more()

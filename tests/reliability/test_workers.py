@@ -9,30 +9,30 @@ import psutil
 import pytest
 
 from tests.api.deployment import deploy
-from tests.patience import wait_until
+from tests.api.server_process import Server
+from tests.patience import PATIENCE_S, wait_until
 from tests.ports import free_port
 from tests.reliability.kill import QUIET
 from tests.reliability.operations import Clients, People
-from tests.reliability.service import START_S, Service
 
 pytestmark = pytest.mark.long
 
 
-def children(service: Service) -> set[int]:
+def children(service: Server) -> set[int]:
     return {child.pid for child in psutil.Process(service.process.pid).children()}
 
 
-def says(service: Service, text: str) -> Callable[[], bool]:
-    return lambda: any(text in line.get("event", "") for line in list(service.log))
+def says(service: Server, text: str) -> Callable[[], bool]:
+    return lambda: any(text in line.get("event", "") for line in service.lines())
 
 
 def test_a_worker_that_is_killed_is_replaced_while_the_others_answer(tmp_path: Path) -> None:
     deployment = deploy(tmp_path, port=free_port(), **QUIET)
-    with Service(deployment, tmp_path) as service:
+    with Server(deployment, tmp_path) as service:
         clients = Clients(service, People(deployment, [1]))
         assert clients.enroll("a", 1).outcome == 201
         first, second = service.workers()
-        service.kill_worker(first)
+        os.kill(first, signal.SIGKILL)
         assert clients.verify("a", 1).accepted
         wait_until(lambda: len(service.workers()) == 2)
         assert second in service.workers()
@@ -41,21 +41,21 @@ def test_a_worker_that_is_killed_is_replaced_while_the_others_answer(tmp_path: P
 
 def test_the_service_fails_when_a_worker_cannot_start(tmp_path: Path) -> None:
     deployment = deploy(tmp_path, port=free_port(), **QUIET)
-    with Service(deployment, tmp_path) as service:
+    with Server(deployment, tmp_path) as service:
         deployment.settings.resolved_decoys_file.write_bytes(b"no decoys")
-        service.kill_worker(service.workers()[0])
-        assert service.process.wait(timeout=START_S) == 1
+        os.kill(service.workers()[0], signal.SIGKILL)
+        assert service.process.wait(timeout=PATIENCE_S) == 1
         assert says(service, "start failed")()
 
 
 def test_workers_end_with_the_first_process(tmp_path: Path) -> None:
     deployment = deploy(tmp_path, port=free_port(), **QUIET)
-    with Service(deployment, tmp_path) as service:
+    with Server(deployment, tmp_path) as service:
         clients = Clients(service, People(deployment, [1]))
         assert clients.enroll("a", 1).outcome == 201
         os.kill(service.process.pid, signal.SIGKILL)
         service.process.wait()
         wait_until(says(service, "the first process is gone"))
         wait_until(lambda: not service.is_ready())
-        with Service(deployment, tmp_path) as again:
+        with Server(deployment, tmp_path) as again:
             assert Clients(again, People(deployment, [1])).verify("a", 1).accepted
