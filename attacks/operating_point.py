@@ -10,7 +10,7 @@ from typing import TypeAlias
 import numpy as np
 
 from attacks.bed import LEAST_FACES, LEAST_VICTIMS, AttackSetup, Pairs, Testbed
-from attacks.runner import Recovery, recoveries
+from attacks.recovery import Recovery, recoveries
 from attacks.stored.foot_point import foot_point
 from attacks.stored.second_moments import second_moments
 from templates.contract.binding import MAX_M
@@ -233,7 +233,7 @@ def judge_privacy(
     """
     strongest = max(thefts, key=_strength).to_json()
     faces = max(theft.faces or 0 for theft in thefts)
-    victims = min(theft.found.trials for theft in thefts if theft.faces is not None)
+    victims = min(theft.matched.trials for theft in thefts if theft.faces is not None)
     shortfall = uncovered
     if shortfall is None and (faces < LEAST_FACES or victims < LEAST_VICTIMS):
         shortfall = (
@@ -242,7 +242,7 @@ def judge_privacy(
         )
     unlimited = isinstance(strongest["faces"], str)
     return Judgement(
-        max(thefts, key=_strength).found,
+        max(thefts, key=_strength).matched,
         PRIVACY_LIMIT,
         {
             "axes": axes,
@@ -260,8 +260,8 @@ def judge_privacy(
 
 def _strength(theft: Recovery) -> tuple[bool, float, float]:
     """A share above the limit counts before a bound, and a bound before a share."""
-    found = theft.found
-    return found.value > PRIVACY_LIMIT, upper_bound(found.errors, found.trials), found.value
+    rate = theft.matched
+    return rate.value > PRIVACY_LIMIT, upper_bound(rate.errors, rate.trials), rate.value
 
 
 def _predicted(
@@ -276,10 +276,10 @@ def _predicted(
     by_dim = [thieves(bed), *(thieves(bed.at(m)) for m in dims[1:])]
     lines = []
     for drawn in (False, True):
-        found = [[one.found for one in made if (one.faces is None) == drawn] for made in by_dim]
-        if found[0]:
-            best = [max(rate.errors for rate in rates) for rates in found]
-            lines.append(_line(best, found[0][0].trials, dims))
+        rates = [[one.matched for one in made if (one.faces is None) == drawn] for made in by_dim]
+        if rates[0]:
+            best = [max(one.errors for one in of_dim) for of_dim in rates]
+            lines.append(_line(best, rates[0][0].trials, dims))
     return lambda m: max(float(1 / (1 + np.exp(-line[0] - line[1] * m))) for line in lines)
 
 
@@ -411,12 +411,12 @@ def judge_groups(contract: Contract) -> Judgement | None:
         judged,
         key=lambda one: (shown_above(one[0], one[1]), one[0].fmr.value, one[0].fmr.trials),
     )
-    limit, found = GROUP_LIMIT * target, worst.fmr
+    limit, highest = GROUP_LIMIT * target, worst.fmr
     shortfall = None
-    if found.value > limit and not shown_above(worst, target):
+    if highest.value > limit and not shown_above(worst, target):
         shortfall = f"the highest of {groups} groups may be above the limit by chance"
     return Judgement(
-        found,
+        highest,
         limit,
         {
             "level": name,

@@ -5,8 +5,12 @@ from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from typing import Any, TypeAlias
 
+import numpy as np
+from numpy.typing import NDArray
+
 from templates.contract.canonical import Json
 from templates.contract.levels import Rate
+from verify.metrics import rate
 
 
 class Property(StrEnum):
@@ -69,8 +73,6 @@ class Knowledge:
         False where nothing needs to be stolen.
     several
         Several templates of one person.
-    unrotated
-        Nothing is gained from a template that is still in a secret rotation.
     generator
         How templates are lifted, the model and the decoy generator, which clients have.
     faces
@@ -85,7 +87,6 @@ class Knowledge:
 
     template: bool = True
     several: bool = False
-    unrotated: bool = False
     generator: bool = False
     faces: bool = False
     lifting: bool = False
@@ -269,3 +270,13 @@ def unproven(control: AttackOutcome, what: str) -> str | None:
     if control.succeeds:
         return None
     return f"it proves nothing, for its control, {what}, does not succeed either"
+
+
+def share_of(hits: NDArray[np.bool_]) -> Rate:
+    """Count successes as a rate with its interval."""
+    return rate(int(np.count_nonzero(hits)), len(hits))
+
+
+def joined(*parts: str) -> str:
+    """Put the parts of a variant's name together, without the empty ones."""
+    return ", ".join(part for part in parts if part)

@@ -9,6 +9,10 @@ from attacks.bed import Testbed
 from templates.keys.randomness import KEY_BYTES, Keystream
 from templates.keys.rotation import SignedCosineRotation, TenantRotation, holder_rotation
 from templates.space.subspace import SubspaceBatch, Turn
+from verify.cohort import Probes
+
+KEPT = "holder's key kept"
+"""The variant of a row whose templates are turned as a holder's key turns them."""
 
 
 def rotations_of(
@@ -43,6 +47,13 @@ def turned_back(batch: SubspaceBatch, rotations: Sequence[SignedCosineRotation])
 def _each_turned(batch: SubspaceBatch, turns: Sequence[Turn]) -> SubspaceBatch:
     pairs = zip(batch, turns, strict=True)
     return SubspaceBatch.of([template.turned_by(turn) for template, turn in pairs])
+
+
+def turned_probes(probes: Probes, rotations: Sequence[SignedCosineRotation]) -> Probes:
+    """Turn each probe by its rotation, (V, k) float32 or lifted ones."""
+    if isinstance(probes, SubspaceBatch):
+        return turned(probes, rotations)
+    return np.ascontiguousarray(turned_points(probes, rotations), dtype=np.float32)
 
 
 def turned_points(

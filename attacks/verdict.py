@@ -97,7 +97,7 @@ LIMITS: tuple[Limit, ...] = (
         WITH_KEY,
         1.0,
         "what no template withstands: success by a right to scores, or where every key leaked and "
-        "templates are linked, replayed, or several of one person",
+        "templates are sent, or several are of one person",
     ),
     Limit(
         WITHOUT_KEY,
@@ -117,8 +117,6 @@ _OF_A_TEMPLATE = (Property.IRREVERSIBILITY, Property.CONFIDENTIALITY)
 _BY_DESIGN = {
     Property.IRREVERSIBILITY: "templates of several photos of one person come near each other in "
     "the person",
-    Property.UNLINKABILITY: "un-rotated templates of one person are near each other, by which the "
-    "service knows the person",
     Property.RENEWABILITY: "the renewed template holds the same face, and the same photos give the "
     "same template again",
     Property.IMPERSONATION: "an un-rotated template holds vectors that it accepts",

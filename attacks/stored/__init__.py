@@ -1,6 +1,6 @@
 """Attacks on stored templates and on the decision about probes: one file each.
 
-Whatever a module here declares by :func:`attacks.runner.attack` is run by ``veilface audit
+Whatever a module here declares by :func:`attacks.attack.attack` is run by ``veilface audit
 templates``.
 """
 
@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from importlib import import_module
 from pkgutil import iter_modules
 
-from attacks.runner import Attack
+from attacks.attack import Attack
 
 
 def attacks_on_templates() -> Iterator[Attack]:

@@ -5,9 +5,9 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from attacks.attack import Guesses, attack
 from attacks.bed import Testbed
 from attacks.outcomes import Knowledge, Property
-from attacks.runner import Guesses, attack
 from templates.space.embedding import normalised
 from templates.space.subspace import SubspaceBatch
 

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from attacks.attack import Hits, attack
 from attacks.bed import Testbed
 from attacks.decisions import fmr_of, score
 from attacks.errors import AuditError
 from attacks.outcomes import Knowledge, Property
-from attacks.runner import Hits, attack
 from templates.distances import Metric, pairwise_distances, similarity
 from templates.space.embedding import normalised
 from templates.space.subspace import SubspaceBatch

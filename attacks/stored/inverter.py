@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from attacks.attack import Guesses, attack
 from attacks.bed import Testbed
 from attacks.errors import AuditError
 from attacks.outcomes import Knowledge, Property
-from attacks.runner import Guesses, attack
 from attacks.stored.second_moments import likeliest
 from templates.space.embedding import normalised
 from templates.space.subspace import SubspaceBatch

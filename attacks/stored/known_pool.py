@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from attacks.attack import Guesses, Probes, attack
 from attacks.bed import Testbed
 from attacks.outcomes import Knowledge, Property
-from attacks.runner import Guesses, Probes, attack
 from templates.distances import Metric, nearest
 from templates.space.embedding import normalised
 from templates.space.subspace import SubspaceBatch

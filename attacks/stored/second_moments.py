@@ -11,9 +11,9 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from attacks.attack import Guesses, attack
 from attacks.bed import Testbed
 from attacks.outcomes import Knowledge, Property
-from attacks.runner import Guesses, attack
 from attacks.second_order import Moments, likeliest_embeddings
 from templates.space.lifting import plain_strategy
 from templates.space.subspace import SubspaceBatch

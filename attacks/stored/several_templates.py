@@ -13,9 +13,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from attacks.attack import Guesses, attack
 from attacks.bed import Testbed
 from attacks.outcomes import Knowledge, Property
-from attacks.runner import Guesses, attack
 from attacks.stored.second_moments import likeliest
 from templates.space.embedding import normalised
 from templates.space.subspace import SubspaceBatch

@@ -5,9 +5,9 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from attacks.attack import Probes, attack
 from attacks.bed import Testbed
 from attacks.outcomes import Knowledge, Property
-from attacks.runner import Probes, attack
 from attacks.stored.foot_point import foot_points
 from attacks.stored.nearest_neighbour import nearest_points
 from attacks.stored.second_moments import likeliest

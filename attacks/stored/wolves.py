@@ -10,11 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from attacks.attack import Probes, attack
 from attacks.bed import Testbed
 from attacks.decisions import score
 from attacks.outcomes import Knowledge, Property
 from attacks.point_ascent import ascend_points
-from attacks.runner import Probes, attack, passes_checks
+from attacks.presented import passes_checks
 from attacks.wolf_ascent import Ground, ascend_subspaces
 from templates.contract.document import Calibration, Level
 from templates.contract.nobody import Nobody

@@ -6,11 +6,12 @@ from typing import cast
 
 import numpy as np
 
+from attacks.attack import Attack
 from attacks.audit import AuditPlan, audit_bed
 from attacks.bed import Effort, Testbed
 from attacks.outcomes import AttackOutcome
 from attacks.population import Population, draw_population
-from attacks.runner import Attack, run_attack
+from attacks.runner import run_attack
 from models.pack import ModelPack
 from templates.contract.document import Rate
 from templates.decoys import DecoyGenerator, DecoyPool

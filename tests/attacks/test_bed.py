@@ -5,7 +5,7 @@ from attacks.bed import MEANS, ONE_PHOTO, PHOTOS, AttackSetup, Pairs, face_count
 from attacks.errors import AuditError
 from attacks.operating_point import thieves
 from attacks.population import ENROLLED_PHOTOS, draw_population
-from attacks.runner import Recovery
+from attacks.recovery import Recovery
 from attacks.stored.second_moments import SPHERE_SHARES
 from templates.errors import DecoyError
 from templates.space.lifting import Strategy
@@ -23,7 +23,7 @@ def setup_with(kind: np.ndarray, *, shuffled: bool = False) -> AttackSetup:
 
 def best(thefts: list[Recovery], *, drawn: bool = False) -> Recovery:
     return max(
-        (one for one in thefts if (one.faces is None) == drawn), key=lambda one: one.found.value
+        (one for one in thefts if (one.faces is None) == drawn), key=lambda one: one.matched.value
     )
 
 
@@ -33,19 +33,19 @@ def test_decoys_of_another_kind_and_random_lifting_fail(axes: int, strategy: Str
     bed = setup_with(OTHER).bed(strategy, axes=axes, m=8)
     assert bed.victims.enrolled.shape == (120, axes)
     strongest = best(thieves(bed))
-    assert strongest.found.value > 0.7
-    assert strongest.found.trials == 120
+    assert strongest.matched.value > 0.7
+    assert strongest.matched.trials == 120
 
 
 def test_more_decoys_of_the_same_kind_hide_more() -> None:
     bed = setup_with(FACES).bed(Strategy.ADVERSARIAL, axes=N, m=2)
-    few, many = (best(thieves(one)).found for one in (bed, bed.at(20)))
+    few, many = (best(thieves(one)).matched for one in (bed, bed.at(20)))
     assert many.value < few.value - 0.3
 
 
 def test_photos_of_other_people_are_matched_by_chance() -> None:
     thefts = thieves(setup_with(OTHER, shuffled=True).bed(Strategy.ADVERSARIAL, axes=N, m=8))
-    assert best(thefts).found.value < 0.05
+    assert best(thefts).matched.value < 0.05
     assert max(theft.control.value for theft in thefts) < 0.05
 
 
@@ -84,7 +84,7 @@ def test_an_attacker_without_limit_finds_more_where_decoys_fit_worse() -> None:
         real = np.einsum("ij,ij->i", setup.victims.enrolled, setup.victims.fresh)
         assert np.isclose(np.sort(real)[:, None], seen, atol=1e-5).any(axis=0).all()
         found.append(best(thieves(bed), drawn=True))
-    assert found[1].found.value > found[0].found.value + 0.2
+    assert found[1].matched.value > found[0].matched.value + 0.2
     assert found[0].to_json()["faces"] == "unlimited, simulated"
 
 

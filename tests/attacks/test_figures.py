@@ -15,7 +15,7 @@ SCHEMES = (
     {"strategy": "adversarial", "decoys": "generator", "dim": 16},
     {"strategy": "random", "decoys": None, "dim": 4},
 )
-SETTINGS = ("secret rotations", "one tenant", "holder's key kept", "keys leaked")
+SETTINGS = ("secret rotations", "one tenant", "holder's key kept", "one set for both")
 SCORES = ("nearest points", "foot lengths")
 
 

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from attacks.attack import Guesses
 from attacks.bed import LEAST_VICTIMS, AttackSetup
 from attacks.operating_point import (
     AIM,
@@ -17,7 +18,7 @@ from attacks.operating_point import (
     judge_groups,
     judge_privacy,
 )
-from attacks.runner import Guesses, Recovery
+from attacks.recovery import Recovery
 from templates.contract.levels import GroupRates, Level, Rate
 from templates.contract.verdict import Judgement
 from templates.space.lifting import Strategy
