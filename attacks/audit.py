@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from attacks.bed import AttackSetup, Effort, Testbed
+from attacks.bed import Effort, Testbed
 from attacks.errors import AuditError
 from attacks.further_faces import SAME_PHOTO, FurtherFaces, strangers_among
 from attacks.outcomes import AttackOutcome
 from attacks.population import Population, draw_population, without_decoy_people
 from attacks.runner import run_attack
+from attacks.setup import AttackSetup
 from attacks.stored import attacks_on_templates
 from models.extraction import Extraction
 from models.pack import ModelPack

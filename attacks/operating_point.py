@@ -9,8 +9,9 @@ from typing import TypeAlias
 
 import numpy as np
 
-from attacks.bed import LEAST_FACES, LEAST_VICTIMS, AttackSetup, Pairs, Testbed
+from attacks.bed import LEAST_FACES, LEAST_VICTIMS, Pairs, Testbed
 from attacks.recovery import Recovery, recoveries
+from attacks.setup import AttackSetup
 from attacks.stored.foot_point import foot_point
 from attacks.stored.second_moments import second_moments
 from templates.contract.binding import MAX_M

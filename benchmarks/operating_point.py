@@ -15,8 +15,9 @@ from pathlib import Path, PurePath
 import numpy as np
 from numpy.typing import NDArray
 
-from attacks.bed import AttackSetup, Pairs
+from attacks.bed import Pairs
 from attacks.operating_point import OperatingPoint, choose_and_judge
+from attacks.setup import AttackSetup
 from models.extraction import Extractor
 from models.pack import ModelPack
 from templates.contract.document import Binding, Contract

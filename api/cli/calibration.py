@@ -10,13 +10,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from attacks.bed import AttackSetup
 from attacks.operating_point import (
     OperatingPoint,
     choose_and_judge,
     judge_accuracy,
     judge_groups,
 )
+from attacks.setup import AttackSetup
 from models.extraction import Extraction
 from models.pack import ModelPack
 from templates.contract.document import Contract

@@ -16,7 +16,8 @@ from typing import TypeVar
 
 from api.cli.decoys import photos_of
 from api.cli.errors import CommandError
-from attacks.bed import LEAST_FACES, LEAST_VICTIMS, MOST_ATTACKED
+from attacks.bed import LEAST_FACES, LEAST_VICTIMS
+from attacks.setup import MOST_ATTACKED
 from templates.decoys.fitting import FACES_PER_DIMENSION, MIN_DESCRIPTORS
 from verify import LabelledFolder
 from verify.metrics import resolvable

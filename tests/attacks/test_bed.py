@@ -1,11 +1,12 @@
 import numpy as np
 import pytest
 
-from attacks.bed import MEANS, ONE_PHOTO, PHOTOS, AttackSetup, Pairs, face_counts
+from attacks.bed import Pairs
 from attacks.errors import AuditError
 from attacks.operating_point import thieves
 from attacks.population import ENROLLED_PHOTOS, draw_population
 from attacks.recovery import Recovery
+from attacks.setup import MEANS, ONE_PHOTO, PHOTOS, AttackSetup, face_counts
 from attacks.stored.second_moments import SPHERE_SHARES
 from templates.errors import DecoyError
 from templates.space.lifting import Strategy

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from attacks.attack import Guesses
-from attacks.bed import LEAST_VICTIMS, AttackSetup
+from attacks.bed import LEAST_VICTIMS
 from attacks.operating_point import (
     AIM,
     MOST_BYTES,
@@ -19,6 +19,7 @@ from attacks.operating_point import (
     judge_privacy,
 )
 from attacks.recovery import Recovery
+from attacks.setup import AttackSetup
 from templates.contract.levels import GroupRates, Level, Rate
 from templates.contract.verdict import Judgement
 from templates.space.lifting import Strategy

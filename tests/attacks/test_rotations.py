@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from attacks.bed import AttackSetup, Pairs
+from attacks.bed import Pairs
 from attacks.rotations import holder_rotations_of, rotations_of, turned, turned_back, turned_points
 from attacks.runner import run_attack
+from attacks.setup import AttackSetup
 from attacks.stored.foot_point import foot_points
 from attacks.stored.linkage import foot_lengths
 from enroll import Enroller, Holder
@@ -110,9 +111,7 @@ def test_only_lengths_survive_a_rotation() -> None:
 
 
 @pytest.mark.long
-def test_real_faces_do_not_link_in_secret_rotations(
-    mbf_pack_dir: Path, lfw_aligned: Path
-) -> None:
+def test_real_faces_do_not_link_in_secret_rotations(mbf_pack_dir: Path, lfw_aligned: Path) -> None:
     """Two photos each of 60 people, and decoys of 200 others."""
     folder = labelled_folder(lfw_aligned)
     names = np.asarray(folder.identities)

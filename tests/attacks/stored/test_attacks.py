@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from attacks.attack import Attack
-from attacks.bed import AttackSetup, Effort, Pairs, Testbed
+from attacks.bed import Effort, Pairs, Testbed
 from attacks.outcomes import AttackOutcome, KnowledgeLevel, Leaked
 from attacks.runner import run_attack
+from attacks.setup import AttackSetup
 from attacks.stored.foot_point import foot_point, foot_points
 from attacks.stored.hill_climbing import hill_climbing
 from attacks.stored.inverter import inverter
