@@ -4,12 +4,12 @@ import argparse
 import json
 import sys
 import tempfile
-from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 from tests.reliability.cluster import Cluster
+from tests.reliability.evidence import Report
 from tests.reliability.full_disk import (
     FileSizeLimit,
     FullFileSystem,
@@ -19,77 +19,44 @@ from tests.reliability.full_disk import (
 )
 from tests.reliability.kill import kill_run
 from tests.reliability.outage import outage_run
-from tests.reliability.races import lockout_run, race_run
+from tests.reliability.races import CLIENTS, lockout_run, race_run
 
 OPERATIONS_A_KILL = 10
+SCENARIOS = ("kill", "races", "lockout", "outage", "full-disk")
 
 
-def _kill(arguments: argparse.Namespace, url: str | None, folder: Path) -> dict[str, Any]:
+def run(arguments: argparse.Namespace, folder: Path, resources: ExitStack) -> Report:
+    """Run one scenario."""
+    operations, seed = arguments.operations, arguments.seed
+    if arguments.scenario == "outage":
+        cluster, modes = resources.enter_context(Cluster()), ("fast", "immediate") * 5
+        return outage_run(cluster, folder, modes=modes, down_s=5.0, seed=seed)
+    if arguments.scenario == "full-disk":
+        rounds: dict[str, Any] = {"rounds": 5, "short_s": 4.0, "seed": seed}
+        if not may_mount():
+            return full_disk_run(FileSizeLimit(), folder / "veilface.db", folder, **rounds)
+        small = resources.enter_context(small_file_system())
+        return full_disk_run(FullFileSystem(small), small / "veilface.db", folder, **rounds)
+    postgres = arguments.database == "postgres"
+    url = resources.enter_context(Cluster()).url if postgres else None
+    if arguments.scenario == "races":
+        return race_run(url, folder, each=max(1, operations // CLIENTS), seed=seed)
+    if arguments.scenario == "lockout":
+        return lockout_run(url, folder, subjects=20)
     return kill_run(
-        arguments.database,
         url,
         folder,
-        operations=arguments.operations,
-        kills=arguments.kills or arguments.operations // OPERATIONS_A_KILL,
-        seed=arguments.seed,
+        operations=operations,
+        kills=arguments.kills or operations // OPERATIONS_A_KILL,
+        seed=seed,
         progress=lambda text: print(text, file=sys.stderr, flush=True),
-    ).as_dict()
-
-
-def _races(arguments: argparse.Namespace, url: str | None, folder: Path) -> dict[str, Any]:
-    each = max(1, arguments.operations // 32)
-    return race_run(arguments.database, url, folder, each=each, seed=arguments.seed).as_dict()
-
-
-def _lockout(arguments: argparse.Namespace, url: str | None, folder: Path) -> dict[str, Any]:
-    return lockout_run(arguments.database, url, folder, subjects=20, seed=arguments.seed).as_dict()
-
-
-def _outage(arguments: argparse.Namespace, folder: Path) -> dict[str, Any]:
-    with Cluster() as cluster:
-        modes = ("fast", "immediate") * 5
-        return outage_run(cluster, folder, modes=modes, down_s=5.0, seed=arguments.seed).as_dict()
-
-
-def _full_disk(arguments: argparse.Namespace, folder: Path) -> dict[str, Any]:
-    report = {}
-    with ExitStack() as mounts:
-        if may_mount():
-            small = mounts.enter_context(small_file_system())
-            report["full file system"] = full_disk_run(
-                FullFileSystem(small),
-                small / "veilface.db",
-                folder / "full",
-                rounds=5,
-                short_s=4.0,
-                seed=arguments.seed,
-            ).as_dict()
-    report["limit of file sizes"] = full_disk_run(
-        FileSizeLimit(),
-        folder / "limit.db",
-        folder / "limit",
-        rounds=5,
-        short_s=4.0,
-        seed=arguments.seed,
-    ).as_dict()
-    return report
-
-
-ON_EITHER: dict[str, Callable[[argparse.Namespace, str | None, Path], dict[str, Any]]] = {
-    "kill": _kill,
-    "races": _races,
-    "lockout": _lockout,
-}
-ON_ONE: dict[str, Callable[[argparse.Namespace, Path], dict[str, Any]]] = {
-    "outage": _outage,
-    "full-disk": _full_disk,
-}
+    )
 
 
 def main() -> int:
     """Run one scenario; 1 if anything was violated."""
     parser = argparse.ArgumentParser(prog="python -m tests.reliability", description=__doc__)
-    parser.add_argument("scenario", choices=[*ON_EITHER, *ON_ONE])
+    parser.add_argument("scenario", choices=SCENARIOS)
     parser.add_argument("--database", choices=["sqlite", "postgres"], default="sqlite")
     parser.add_argument("--operations", type=int, default=500)
     parser.add_argument("--kills", type=int, help="default: one for ten operations")
@@ -97,21 +64,9 @@ def main() -> int:
     arguments = parser.parse_args()
     with ExitStack() as resources:
         folder = Path(resources.enter_context(tempfile.TemporaryDirectory(prefix="veilface-")))
-        if arguments.scenario in ON_ONE:
-            report = ON_ONE[arguments.scenario](arguments, folder)
-        else:
-            postgres = arguments.database == "postgres"
-            url = resources.enter_context(Cluster()).url if postgres else None
-            report = ON_EITHER[arguments.scenario](arguments, url, folder)
-    print(json.dumps(report, indent=1))
-    return int(any(_violations(report)))
-
-
-def _violations(report: dict[str, Any]) -> list[str]:
-    own = list(report.get("violations", []))
-    return own + [
-        each for value in report.values() if isinstance(value, dict) for each in _violations(value)
-    ]
+        report = run(arguments, folder, resources)
+    print(json.dumps({**report.figures, "violations": report.violations}, indent=1))
+    return int(bool(report.violations))
 
 
 if __name__ == "__main__":

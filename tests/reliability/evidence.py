@@ -10,7 +10,7 @@ import math
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import sqlalchemy as sa
@@ -27,6 +27,41 @@ from tests.reliability.operations import Operation
 
 DECIDED = ("accept", "reject")
 ENROLLED = {True: "replaced", False: "created"}
+
+
+@dataclass
+class Report:
+    """Figures of a run by name; ``violations`` is empty where all holds."""
+
+    figures: dict[str, Any] = field(default_factory=dict)
+    violations: list[str] = field(default_factory=list)
+
+    def add(self, name: str, number: int = 1) -> None:
+        """Count something."""
+        self.figures[name] = self.figures.get(name, 0) + number
+
+    def examine(
+        self, asked: "Asked", subjects: Sequence[str], allowed: Callable[[Operation], bool]
+    ) -> None:
+        """Compare what is there with what clients were answered; the service must have ended.
+
+        Parameters
+        ----------
+        allowed
+            Which operations may have ended without success.
+        """
+        examined = examine(asked, subjects)
+        self.violations += [*unexpected(asked.history, allowed), *examined.violations]
+        self.figures |= {"of_these_effective": examined.effective, "audit_lines": examined.lines}
+        counted = {"enroll": "enrollments", "erase": "erasures", "verify": "decisions"}
+        for each in asked.history:
+            self.add("answers_503", each.outcome == 503)
+            if each.kind in counted:
+                self.add(f"acknowledged_{counted[each.kind]}", each.answered_well)
+                unsure = "writes" if each.writes else "decisions"
+                self.add(f"unacknowledged_{unsure}", each.may_have_happened)
+        slowest = max(each.seconds for each in asked.history if each.answered < math.inf)
+        self.figures["slowest_s"] = round(slowest, 2)
 
 
 class Asked(Protocol):

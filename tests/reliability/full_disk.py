@@ -9,9 +9,8 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import httpx
 
@@ -19,7 +18,7 @@ from tests.api.deployment import deploy
 from tests.api.server_process import Server
 from tests.patience import PATIENCE_S
 from tests.ports import free_port
-from tests.reliability.evidence import examine, unexpected
+from tests.reliability.evidence import Report
 from tests.reliability.kill import QUIET
 from tests.reliability.load import Load, look_at_all, make_subjects, people_of
 from tests.reliability.operations import Clients, Operation, People
@@ -106,34 +105,17 @@ def small_file_system() -> Iterator[Path]:
         try:
             yield folder
         finally:
-            # Lazily: who still has a file open keeps it until it closes it.
+            # Lazily: a process that still has a file open keeps it until it closes it.
             libc.umount2(str(folder).encode(), 2)
     finally:
         folder.rmdir()
 
 
-@dataclass
-class FullDiskReport:
-    """Figures of a run; `violations` is empty where all holds."""
-
-    rounds: int = 0
-    refused: int = 0
-    slowest_s: float = 0.0
-    recovered_after_s: list[float] = field(default_factory=list)
-    acknowledged_writes: int = 0
-    acknowledged_decisions: int = 0
-    audit_lines: int = 0
-    violations: list[str] = field(default_factory=list)
-
-    def as_dict(self) -> dict[str, Any]:
-        return asdict(self)
-
-
 def full_disk_run(
     shortage: Shortage, database: Path, folder: Path, *, rounds: int, short_s: float, seed: int
-) -> FullDiskReport:
+) -> Report:
     """Take the space away and give it back, in the middle of enrollments and erasures."""
-    report = FullDiskReport()
+    report = Report()
     subjects = make_subjects(6)
     deployment = deploy(
         folder,
@@ -154,15 +136,8 @@ def full_disk_run(
             report.violations.append("workers died: " + service.tail())
         look_at_all(clients, subjects)
         service.kill()
-        examined = examine(clients, list(subjects))
-    report.violations += [*unexpected(clients.history, _is_unavailable), *examined.violations]
+        report.examine(clients, list(subjects), _is_unavailable)
     report.violations += service.defects()
-    report.audit_lines = examined.lines
-    for each in clients.history:
-        report.refused += each.outcome == 503
-        report.acknowledged_writes += each.writes and each.answered_well
-        report.acknowledged_decisions += each.kind == "verify" and each.answered_well
-        report.slowest_s = round(max(report.slowest_s, each.seconds), 2)
     return report
 
 
@@ -170,7 +145,7 @@ def _is_unavailable(each: Operation) -> bool:
     return each.outcome == 503 and each.code == "store_unavailable" and each.retry_after == "5"
 
 
-def _round(shortage: Shortage, clients: Clients, short_s: float, report: FullDiskReport) -> None:
+def _round(shortage: Shortage, clients: Clients, short_s: float, report: Report) -> None:
     service, before = clients.service, len(clients.history)
     shortage.take(service)
     time.sleep(short_s)
@@ -179,11 +154,10 @@ def _round(shortage: Shortage, clients: Clients, short_s: float, report: FullDis
     refused = [each for each in clients.history[before:] if each.outcome == 503]
     if not refused:
         report.violations.append("no request was refused without space")
-    report.rounds += 1
     _await_ready(service, freed, report)
 
 
-def _await_ready(service: Server, freed: float, report: FullDiskReport) -> None:
+def _await_ready(service: Server, freed: float, report: Report) -> None:
     """Every worker must get ready by itself; a fresh connection asks either of them."""
     in_a_row = 0
     while in_a_row < 10:
@@ -191,10 +165,11 @@ def _await_ready(service: Server, freed: float, report: FullDiskReport) -> None:
             report.violations.append("not ready after space was freed")
             return
         in_a_row = in_a_row + 1 if service.is_ready() else 0
-    report.recovered_after_s.append(round(time.monotonic() - freed, 2))
+    recovered = report.figures.setdefault("recovered_after_s", [])
+    recovered.append(round(time.monotonic() - freed, 2))
 
 
-def _one_at_a_time(shortage: Shortage, clients: Clients, report: FullDiskReport) -> None:
+def _one_at_a_time(shortage: Shortage, clients: Clients, report: Report) -> None:
     """What each call answers without space, with nobody else about."""
     service = clients.service
     subject, person = "subject-0", 1

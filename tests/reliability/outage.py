@@ -4,9 +4,7 @@ import math
 import threading
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
 
 import httpx
 
@@ -15,7 +13,7 @@ from tests.api.server_process import Server
 from tests.patience import PATIENCE_S, wait_until
 from tests.ports import free_port
 from tests.reliability.cluster import Cluster
-from tests.reliability.evidence import examine, unexpected
+from tests.reliability.evidence import Report
 from tests.reliability.kill import QUIET
 from tests.reliability.load import Load, look_at_all, make_subjects, people_of
 from tests.reliability.operations import Clients, Operation, People
@@ -25,33 +23,6 @@ READERS = 3
 KINDS = {"enroll", "erase", "verify", "describe", "contract"}
 LEAST_REFUSED = 20
 """Requests that are answered before the database comes back: none waits for it."""
-
-
-@dataclass
-class Outage:
-    """One stop and start of the database."""
-
-    mode: str
-    requests: int = 0
-    slowest_s: float = 0.0
-    recovered_after_s: float = 0.0
-
-
-@dataclass
-class OutageReport:
-    """Figures of a run; `violations` is empty where all holds."""
-
-    acknowledged_writes: int = 0
-    unacknowledged_writes: int = 0
-    of_these_effective: int = 0
-    acknowledged_decisions: int = 0
-    answers_503: int = 0
-    audit_lines: int = 0
-    outages: list[Outage] = field(default_factory=list)
-    violations: list[str] = field(default_factory=list)
-
-    def as_dict(self) -> dict[str, Any]:
-        return asdict(self)
 
 
 class _Watch:
@@ -87,9 +58,9 @@ class _Watch:
 
 def outage_run(
     cluster: Cluster, folder: Path, *, modes: Sequence[str], down_s: float, seed: int
-) -> OutageReport:
+) -> Report:
     """Stop the database once in each mode, while clients enroll, erase and verify."""
-    report = OutageReport()
+    report = Report()
     subjects = make_subjects(8)
     deployment = deploy(folder, database_url=cluster.url, port=free_port(), **QUIET)
     people = People(deployment, people_of(subjects))
@@ -108,18 +79,7 @@ def outage_run(
         clients.settle()
         look_at_all(clients, subjects)
         service.kill()
-        examined = examine(clients, list(subjects))
-    history = clients.history
-    report.violations += [
-        *unexpected(history, _is_unavailable),
-        *examined.violations,
-    ]
-    report.of_these_effective, report.audit_lines = examined.effective, examined.lines
-    for each in history:
-        report.acknowledged_writes += each.writes and each.answered_well
-        report.unacknowledged_writes += each.writes and each.may_have_happened
-        report.acknowledged_decisions += each.kind == "verify" and each.answered_well
-        report.answers_503 += each.outcome == 503
+        report.examine(clients, list(subjects), _is_unavailable)
     return report
 
 
@@ -139,7 +99,7 @@ def _stop_and_start(
     watch: _Watch,
     mode: str,
     down_s: float,
-    report: OutageReport,
+    report: Report,
 ) -> None:
     before = len(clients.history)
     cluster.stop(mode)
@@ -162,20 +122,20 @@ def _stop_and_start(
     starting = time.monotonic()
     cluster.start()
     started = time.monotonic()
-    outage = Outage(mode)
-    report.outages.append(outage)
     recovered = _wait_until_well(clients, watch, started)
     if recovered is None:
         report.violations.append(f"{mode}: not well again")
-    else:
-        outage.recovered_after_s = round(max(0.0, recovered - started), 2)
+        recovered = math.nan
     # A request that is still under way is looked at when the run is over.
     asked = [each for each in clients.history[before:] if each.answered < math.inf]
     within = [each for each in asked if stopped <= each.started and each.answered <= starting]
-    outage.requests = len(within)
     # Those, too, that were under way when it stopped.
     ended = [each for each in asked if stopped <= each.answered <= starting]
-    outage.slowest_s = round(max((each.seconds for each in ended), default=0.0), 2)
+    report.figures[mode] = {
+        "requests": len(within),
+        "slowest_s": round(max((each.seconds for each in ended), default=0.0), 2),
+        "recovered_after_s": round(max(0.0, recovered - started), 2),
+    }
     report.violations += [
         f"{mode}: answered well without a database: {each}" for each in within if each.answered_well
     ]

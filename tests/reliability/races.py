@@ -5,63 +5,28 @@ import threading
 from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import psutil
 
 from tests.api.deployment import deploy
 from tests.api.server_process import Server
 from tests.ports import free_port
-from tests.reliability.evidence import examine, unexpected
+from tests.reliability.evidence import Report
 from tests.reliability.kill import QUIET
 from tests.reliability.load import look_at_all, make_subjects, people_of
 from tests.reliability.operations import Clients, Operation, People
 
 CLIENTS = 32
 SUBJECTS = 5
+LOCKOUT_AFTER = 5
 KINDS = ("enroll", "enroll", "verify", "verify", "verify", "erase", "describe")
 
 
-@dataclass
-class RaceReport:
-    """Figures of a run; `violations` is empty where all holds."""
-
-    database: str
-    clients: int = CLIENTS
-    subjects: int = SUBJECTS
-    operations: dict[str, int] = field(default_factory=dict)
-    most_at_once_on_one_subject: int = 0
-    audit_lines: int = 0
-    violations: list[str] = field(default_factory=list)
-
-    def as_dict(self) -> dict[str, Any]:
-        return asdict(self)
-
-
-@dataclass
-class LockoutReport:
-    """Figures of a run; `violations` is empty where all holds."""
-
-    database: str
-    lockout_after: int
-    subjects: int = 0
-    attempts: int = 0
-    rejections: int = 0
-    locked_out: int = 0
-    violations: list[str] = field(default_factory=list)
-
-    def as_dict(self) -> dict[str, Any]:
-        return asdict(self)
-
-
-def race_run(
-    database: str, database_url: str | None, folder: Path, *, each: int, seed: int
-) -> RaceReport:
+def race_run(database_url: str | None, folder: Path, *, each: int, seed: int) -> Report:
     """Let 32 clients send so many operations each, and look for a serial order."""
-    report = RaceReport(database)
+    report = Report()
     subjects = make_subjects(SUBJECTS)
     deployment = deploy(folder, database_url=database_url, port=free_port(), **QUIET)
     people = People(deployment, people_of(subjects))
@@ -77,28 +42,23 @@ def race_run(
             _at_once(client, CLIENTS)
         look_at_all(clients, subjects)
         service.kill()
-        examined = examine(clients, list(subjects))
-    report.violations += [*unexpected(clients.history, lambda _: False), *examined.violations]
-    report.operations = dict(Counter(each.kind for each in clients.history))
-    report.most_at_once_on_one_subject = max(
+        report.examine(clients, list(subjects), lambda _: False)
+    report.figures["operations"] = dict(Counter(each.kind for each in clients.history))
+    report.figures["most_at_once_on_one_subject"] = max(
         _most_at_once([each for each in clients.history if each.subject == subject])
         for subject in subjects
     )
-    report.audit_lines = examined.lines
     return report
 
 
-def lockout_run(
-    database: str, database_url: str | None, folder: Path, *, subjects: int, seed: int
-) -> LockoutReport:
+def lockout_run(database_url: str | None, folder: Path, *, subjects: int) -> Report:
     """Send wrong probes to one subject after the other, many at once; half are not enrolled."""
-    after = 5
-    report = LockoutReport(database, after, subjects)
+    report = Report()
     deployment = deploy(
         folder,
         database_url=database_url,
         port=free_port(),
-        **{**QUIET, "lockout_after": after, "lockout_first_s": 3600, "compute_slots": 4},
+        **{**QUIET, "lockout_after": LOCKOUT_AFTER, "lockout_first_s": 3600, "compute_slots": 4},
     )
     people = People(deployment, [1, 2])
     with Server(deployment, folder) as service:
@@ -109,7 +69,7 @@ def lockout_run(
                 if number % 2 == 0 and not clients.enroll(subject, 1).answered_well:
                     report.violations.append(f"{subject} was not enrolled")
                 _at_once(partial(_fail, clients, subject), CLIENTS)
-                # Who is who is locked out too.
+                # The enrolled person is locked out too.
                 clients.verify(subject, 1)
                 _count_answers(clients.history, subject, report)
     return report
@@ -119,17 +79,16 @@ def _fail(clients: Clients, subject: str, _: int) -> Operation:
     return clients.verify(subject, 2)
 
 
-def _count_answers(history: Sequence[Operation], subject: str, report: LockoutReport) -> None:
+def _count_answers(history: Sequence[Operation], subject: str, report: Report) -> None:
     asked = [each for each in history if each.kind == "verify" and each.subject == subject]
     answers = Counter(
         (each.outcome, "" if each.code else str(each.answer["decision"])) for each in asked
     )
-    report.attempts += len(asked)
-    report.rejections += answers[200, "reject"]
-    report.locked_out += answers[423, ""]
+    report.add("rejections", answers[200, "reject"])
+    report.add("locked_out", answers[423, ""])
     expected = {
-        (200, "reject"): report.lockout_after,
-        (423, ""): CLIENTS + 1 - report.lockout_after,
+        (200, "reject"): LOCKOUT_AFTER,
+        (423, ""): CLIENTS + 1 - LOCKOUT_AFTER,
     }
     if answers != expected:
         report.violations.append(f"{subject}: {dict(answers)}")
