@@ -1,7 +1,5 @@
-"""Every byte that a deployment has written: files, rows, relation files, logs, open files."""
+"""Every byte that a deployment has written: files, rows, relation files, open files."""
 
-import contextlib
-import secrets
 import stat
 from pathlib import Path
 from typing import Any
@@ -51,55 +49,6 @@ def relation_files(
         if row is not None and row[0]:
             content[name] = bytes(row[0])
     return content
-
-
-def log_position(connection: "psycopg.Connection[Any]") -> int:
-    """Where the server's log goes on, in bytes since its beginning."""
-    row = connection.execute("SELECT pg_current_wal_insert_lsn() - '0/0'::pg_lsn").fetchone()
-    assert row is not None
-    return int(row[0])
-
-
-def keep_log(connection: "psycopg.Connection[Any]") -> None:
-    """Keep the server from recycling its log for as long as the connection is open."""
-    # A server that allows no slots recycles; written_log says so if it has.
-    with contextlib.suppress(
-        psycopg.errors.InsufficientPrivilege,
-        psycopg.errors.ObjectNotInPrerequisiteState,
-        psycopg.errors.ConfigurationLimitExceeded,
-    ):
-        connection.execute(
-            "SELECT pg_create_physical_replication_slot(%s, true, true)",
-            (f"veilface_leak_{secrets.token_hex(6)}",),
-        )
-
-
-def written_log(connection: "psycopg.Connection[Any]", start: int) -> bytes:
-    """What the server wrote to its log since ``start``, to the byte.
-
-    The file of a segment has its full size from the beginning, and is often an old one under a new
-    name: behind the last byte written stands what was written long ago, by other runs too.
-    """
-    connection.execute("CHECKPOINT")  # what was written is in the files, not in memory
-    row = connection.execute(
-        "SELECT pg_current_wal_flush_lsn() - '0/0'::pg_lsn,"
-        " (SELECT setting::bigint FROM pg_settings WHERE name = 'wal_segment_size')"
-    ).fetchone()
-    assert row is not None
-    end, size = int(row[0]), int(row[1])
-    parts = []
-    for segment in range(start // size * size, end, size):
-        first, last = max(start, segment), min(end, segment + size)
-        # Older servers count a boundary as the end of the segment before: one byte further in.
-        inside = f"{(segment + 1) >> 32:X}/{(segment + 1) & 0xFFFFFFFF:X}"
-        content = connection.execute(
-            "SELECT pg_read_binary_file('pg_wal/' || pg_walfile_name(%s), %s, %s, true)",
-            (inside, first - segment, last - first),
-        ).fetchone()
-        if content is None or content[0] is None or len(content[0]) != last - first:
-            raise AssertionError("the server has recycled a part of its log that must be searched")
-        parts.append(bytes(content[0]))
-    return b"".join(parts)
 
 
 def open_files(pid: int) -> dict[str, bytes]:

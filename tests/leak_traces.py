@@ -39,10 +39,8 @@ from tests.leak_material import PEOPLE, PROBE_M, Material, Photo
 from tests.leak_places import (
     copied_tables,
     files_of,
-    log_position,
     open_files,
     relation_files,
-    written_log,
 )
 from tests.patience import PATIENCE_S
 
@@ -106,7 +104,6 @@ class ServiceTraces:
     rows: dict[str, dict[str, bytes]] = field(default_factory=dict)
     values: dict[str, dict[str, list[list[bytes]]]] = field(default_factory=dict)
     relations: dict[str, dict[str, bytes]] = field(default_factory=dict)
-    write_ahead_log: bytes = b""
     files_hidden: str = ""
     open_during_upload: dict[str, bytes] = field(default_factory=dict)
     templates: dict[str, OpenedTemplate] = field(default_factory=dict)
@@ -185,7 +182,7 @@ class ServiceTraces:
         if moment == "running":
             now |= _named("open file", self.open_during_upload)
         if moment == "stopped":
-            now |= {"answers": self.answers, "server's write-ahead log": self.write_ahead_log}
+            now["answers"] = self.answers
         before = order[: order.index(moment)]
         known = {content for each in before for content in getattr(self, each).values()}
         return {name: content for name, content in now.items() if content not in known}
@@ -222,7 +219,6 @@ def exercise(material: Material, folder: Path, *, database_url: str) -> ServiceT
     shutil.copytree(material.folder, folder / "data")
     (folder / "tmp").mkdir()
     (folder / "home").mkdir()
-    start = _log_position(traces)
     ours = ("VEILFACE_", "XDG_", "ORT_")
     environment = {k: v for k, v in os.environ.items() if not k.startswith(ours)} | {
         "HOME": str(folder / "home"),
@@ -272,7 +268,7 @@ def exercise(material: Material, folder: Path, *, database_url: str) -> ServiceT
         process.wait()
     _look(traces, "stopped")
     if traces.kind == "postgres":
-        _compact(traces, start)
+        _compact(traces)
     return traces
 
 
@@ -505,7 +501,7 @@ def _look(traces: ServiceTraces, moment: str) -> None:
     traces.values[moment] = _values(traces)
 
 
-def _compact(traces: ServiceTraces, start: int | None) -> None:
+def _compact(traces: ServiceTraces) -> None:
     store = TemplateStore(
         traces.database_url, MasterKeyring.load(traces.folder / "data" / "master.key")
     )
@@ -513,10 +509,9 @@ def _compact(traces: ServiceTraces, start: int | None) -> None:
         store.compact()
     finally:
         store.close()
-    if start is not None and not traces.files_hidden:
+    if not traces.files_hidden:
         with psycopg.connect(traces.database_url, autocommit=True) as connection:
             traces.relations["compacted"] = relation_files(connection)
-            traces.write_ahead_log = written_log(connection, start)
 
 
 def _values(traces: ServiceTraces) -> dict[str, list[list[bytes]]]:
@@ -532,10 +527,3 @@ def _values(traces: ServiceTraces) -> dict[str, list[list[bytes]]]:
             ]
     engine.dispose()
     return tables
-
-
-def _log_position(traces: ServiceTraces) -> int | None:
-    if traces.kind == "sqlite":
-        return None
-    with psycopg.connect(traces.database_url, autocommit=True) as connection:
-        return log_position(connection)

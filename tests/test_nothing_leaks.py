@@ -18,16 +18,9 @@ import psycopg
 import pytest
 
 from tests.api.cli.conftest import run
-from tests.databases import empty_database, postgres_server
+from tests.databases import empty_database
 from tests.leak_material import Material, make_material
-from tests.leak_places import (
-    copied_tables,
-    files_of,
-    keep_log,
-    log_position,
-    relation_files,
-    written_log,
-)
+from tests.leak_places import copied_tables, files_of, relation_files
 from tests.leak_traces import ServiceTraces, exercise
 from tests.leaks import LeakSearch, as_bytes
 
@@ -61,19 +54,8 @@ def traces(
         )
         return
     # Of its own: in a run of several workers the scene may be set up twice in one of them.
-    with (
-        empty_database() as url,
-        psycopg.connect(postgres_server(), autocommit=True) as connection,
-    ):
-        # The server's log is one for all databases: the controls that another run of these tests
-        # plants would be found in it.
-        connection.execute("SELECT pg_advisory_lock(hashtext('veilface leak tests'))")
-        keep_log(connection)
+    with empty_database() as url:
         yield exercise(material, folder, database_url=url)
-        with psycopg.connect(url, autocommit=True) as emptied:
-            # The controls leave dead rows. A vacuum would write their pages to the log again, after
-            # the lock, when the next run searches it.
-            emptied.execute("TRUNCATE subjects, templates CASCADE")
 
 
 @pytest.fixture(scope="module")
@@ -238,42 +220,6 @@ def test_a_plaintext_row_is_found_in_the_file_of_a_postgresql_table(
             connection.execute("DROP TABLE planted")
 
 
-def test_what_is_planted_in_the_log_of_postgresql_is_found_in_its_range_only(
-    traces: ServiceTraces, search: LeakSearch
-) -> None:
-    """The log is one for all databases, and its files hold remains of earlier logs."""
-    if traces.kind != "postgres":
-        pytest.skip("SQLite's log is searched in the controls of every place")
-    require_files(traces)
-    forms = {k: v for k, v in encodings(traces.vectors[EMBEDDING]).items() if "-of-" not in k}
-    message = "SELECT pg_logical_emit_message(false, 'planted', %s::bytea)"
-    with psycopg.connect(traces.database_url, autocommit=True) as connection:
-        for form, payload in forms.items():
-            before = log_position(connection)
-            connection.execute(message, (payload,))
-            after = log_position(connection)
-            written = written_log(connection, before)
-            assert EMBEDDING in {leak.what for leak in search.find(written)}, form
-            assert not search.find(written_log(connection, after)), form
-
-
-def test_the_log_of_postgresql_is_read_to_the_byte(traces: ServiceTraces) -> None:
-    if traces.kind != "postgres":
-        pytest.skip("SQLite's log is a file, read as it is")
-    require_files(traces)
-    with psycopg.connect(traces.database_url, autocommit=True) as connection:
-        start = log_position(connection)
-        for _ in range(2):  # the header of a page may cut one in two
-            connection.execute("SELECT pg_logical_emit_message(false, 'first', 'here')")
-        connection.execute("SELECT pg_switch_wal()")  # the range goes over a segment's end
-        connection.execute("SELECT pg_logical_emit_message(false, 'second', 'there')")
-        written = written_log(connection, start)
-        end = log_position(connection)
-    assert b"first\0here" in written
-    assert b"second\0there" in written
-    assert len(written) <= end - start
-
-
 def require_files(traces: ServiceTraces) -> None:
     if traces.files_hidden:
         pytest.skip(f"the server does not hand out its files: {traces.files_hidden}")
@@ -347,7 +293,7 @@ def test_a_holders_key_is_kept_nowhere(traces: ServiceTraces) -> None:
             assert not any(form in content for form in forms), place
     for moment in ("running", "erased", "stopped"):
         assert not any(form in traces.database_bytes(moment) for form in forms)
-    assert not any(form in traces.answers + traces.write_ahead_log for form in forms)
+    assert not any(form in traces.answers for form in forms)
     # The control: what a template needs the key for is there.
     salts = [row for row in traces.values["stopped"]["templates"] if b"None" not in row]
     assert len(salts) == 1
