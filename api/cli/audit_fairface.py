@@ -6,7 +6,15 @@ from typing import Annotated
 
 import typer
 
-from api.cli.audit_report import Out, Seed, model_json, reported, share_once_begun, takes_limits
+from api.cli.audit_report import (
+    Out,
+    Seed,
+    model_json,
+    reported,
+    served_scheme,
+    share_once_begun,
+    takes_limits,
+)
 from api.cli.console import message
 from api.cli.descriptors import BULK, Aligned, Cache, Flip, bulk_pack, extract
 from api.cli.errors import UsageError, require_extra
@@ -33,10 +41,9 @@ from attacks.outcomes import GENERATED, RAW, Scheme
 from attacks.population import LEAST_FITTED
 from attacks.report import document
 from models.pack import ModelPack
-from templates.contract.document import Binding, Contract
+from templates.contract.document import Binding
 from templates.decoys import DecoyGenerator
 from templates.distances import on_device
-from templates.errors import VeilfaceError
 from templates.space.lifting import Strategy
 from verify.fairface_labels import CLASSES
 from verify.preparation import acquired_json
@@ -241,10 +248,4 @@ def _deployed(
     source = load_decoys(path, sealer, pack)
     if not isinstance(source, DecoyGenerator):
         raise UsageError(f"{path.name} is a decoy pool; --decoys takes a generator")
-    try:
-        binding = Contract.load(settings.resolved_contract_file, sealer).binding
-        own = source.reduced(binding.axes)
-        binding.require_source(source_id=own.source_id, made_with=own.made_with)
-    except VeilfaceError:
-        return source, None
-    return source, binding
+    return source, served_scheme(settings, sealer, source)

@@ -10,15 +10,20 @@ from typing import Annotated, Any, TypeVar
 
 import typer
 
-from api.cli.console import demo_notice, share_done
+from api.cli.console import demo_notice, message, share_done
 from api.cli.errors import FAILED
 from api.cli.html_report import write_html
 from api.cli.results import Result, Table
+from api.settings import Settings
 from attacks.report import RESULTS, Document
 from attacks.report_tables import VERDICT, markdown, verdict_tables
 from attacks.verdict import LIMITS
 from models.pack import ModelPack
+from templates.contract.document import Binding, Contract
+from templates.decoys import DecoySource
+from templates.errors import VeilfaceError
 from templates.keys.private_file import replace_public
+from templates.keys.sealing import Sealer
 from verify.preparation import recorded_of
 
 Out = Annotated[Path, typer.Option(help="Folder of the report.")]
@@ -128,3 +133,22 @@ def reported(report: Document, out: Path, pack: ModelPack) -> Result:
         ],
         status={True: 0, False: FAILED, None: NOT_SHOWN}[report["passed"]],
     )
+
+
+def served_scheme(settings: Settings, sealer: Sealer, source: DecoySource | None) -> Binding | None:
+    """Return the scheme of the contract in ``data_dir``, where it lifts with this source.
+
+    None, and a note, where it cannot be read: an audit does not need it.
+    """
+    path = settings.resolved_contract_file
+    if source is None or not path.is_file():
+        return None
+    try:
+        binding = Contract.load(path, sealer).binding
+    except VeilfaceError as error:
+        message(f"note: not auditing as the contract in `data_dir` has it: {error}")
+        return None
+    fits = binding.axes <= source.k and (
+        binding.decoy_source_id == source.reduced(binding.axes).source_id
+    )
+    return binding if fits else None

@@ -7,7 +7,15 @@ from typing import Annotated
 
 import typer
 
-from api.cli.audit_report import Out, Seed, model_json, reported, share_once_begun, takes_limits
+from api.cli.audit_report import (
+    Out,
+    Seed,
+    model_json,
+    reported,
+    served_scheme,
+    share_once_begun,
+    takes_limits,
+)
 from api.cli.console import message
 from api.cli.descriptors import BULK, Aligned, Cache, Flip, bulk_pack, extract
 from api.cli.errors import UsageError, require_extra
@@ -27,11 +35,8 @@ from attacks.bed import Effort
 from attacks.population import LEAST_FITTED
 from attacks.report import document
 from attacks.stored.inverter import need
-from templates.contract.document import Binding, Contract
-from templates.decoys import DecoySource
+from templates.contract.document import Contract
 from templates.distances import on_device
-from templates.errors import VeilfaceError
-from templates.keys.sealing import Sealer
 from templates.space.lifting import Strategy
 from verify import labelled_folder
 from verify.preparation import acquired_json
@@ -187,7 +192,7 @@ def templates(
         own = source.reduced(loaded.binding.axes)
         loaded.binding.require_source(source_id=own.source_id, made_with=own.made_with)
     if loaded is None and (dim is None or strategy is None or axes is None):
-        served = _served(settings, sealer, source)
+        served = served_scheme(settings, sealer, source)
         if dim is None:
             dim = str(DEFAULT_DIM if served is None else served.m)
         if strategy is None:
@@ -246,22 +251,3 @@ def templates(
         failure_to_acquire=acquired_json(faces),
     )
     return reported(report, out, pack)
-
-
-def _served(settings: Settings, sealer: Sealer, source: DecoySource | None) -> Binding | None:
-    """Return the scheme of the contract in ``data_dir``, where it lifts with this source.
-
-    None, and a note, where it cannot be read: the audit does not need it.
-    """
-    path = settings.resolved_contract_file
-    if source is None or not path.is_file():
-        return None
-    try:
-        binding = Contract.load(path, sealer).binding
-    except VeilfaceError as error:
-        message(f"note: not auditing as the contract in `data_dir` has it: {error}")
-        return None
-    fits = binding.axes <= source.k and (
-        binding.decoy_source_id == source.reduced(binding.axes).source_id
-    )
-    return binding if fits else None

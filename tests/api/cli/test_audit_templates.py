@@ -14,6 +14,7 @@ import pytest
 
 import attacks.audit
 from api.cli import audit_templates
+from api.cli.audit_report import served_scheme
 from api.cli.options import DEFAULT_DIM
 from api.service.opening import file_sealer, open_keyring
 from api.settings import Settings
@@ -203,7 +204,7 @@ def test_what_is_not_set_is_the_contracts(
     def served(*_: Any) -> Any:
         return SimpleNamespace(m=DIM, strategy=Strategy.HYBRID, axes=100)
 
-    monkeypatch.setattr(audit_templates, "_served", served)
+    monkeypatch.setattr(audit_templates, "served_scheme", served)
     assert planned(world, tmp_path, monkeypatch, *given) == (plan, said)
 
 
@@ -247,13 +248,13 @@ def test_a_contract_of_other_decoys_says_no_dimension(world: World) -> None:
     settings = Settings(data_dir=world.data)
     sealer = file_sealer(open_keyring(settings))
     own = load_source(settings.resolved_decoys_file, sealer)
-    served = audit_templates._served(settings, sealer, own)
+    served = served_scheme(settings, sealer, own)
     assert served is not None
     assert served.m == DIM
     rows = np.random.default_rng(0).normal(size=(150, own.n))
     other = DecoyGenerator.fit(rows / np.linalg.norm(rows, axis=1, keepdims=True))
-    assert audit_templates._served(settings, sealer, other) is None
-    assert audit_templates._served(settings, sealer, None) is None
+    assert served_scheme(settings, sealer, other) is None
+    assert served_scheme(settings, sealer, None) is None
 
 
 @pytest.mark.long
