@@ -172,7 +172,6 @@ def test_a_doubt_is_not_hidden_behind_a_small_success() -> None:
     [
         (Property.IRREVERSIBILITY, Leaked.HOLDER_KEYS, KnowledgeLevel.TEMPLATES),
         (Property.IRREVERSIBILITY, Leaked.DATABASE, KnowledgeLevel.RIGHT),
-        (Property.UNLINKABILITY, Leaked.HOLDER_KEYS, KnowledgeLevel.ALGORITHM),
         (Property.RENEWABILITY, Leaked.HOLDER_KEYS, KnowledgeLevel.ALGORITHM),
         (Property.IMPERSONATION, Leaked.HOLDER_KEYS, KnowledgeLevel.ALGORITHM),
     ],
