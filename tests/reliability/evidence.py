@@ -321,6 +321,8 @@ class _Examination:
         left = [_Left(-math.inf, None)]
         for each in self._operations(self._lines_of(subject)):
             well = each.answered_well
+            if each.kind == "describe":
+                continue  # a line says that nobody is enrolled
             if each.kind == "verify":
                 person = None if enrolled is None else enrolled.person
                 if well and each.accepted != (person == each.person):
@@ -342,7 +344,7 @@ class _Examination:
         self._described(subject, left)
 
     def _described(self, subject: str, left: Sequence["_Left"]) -> None:
-        """A description, which has no line, saw what was left at a moment of its own.
+        """A description saw what was left at a moment of its own, which no line tells.
 
         One that was sent after another one's answer saw the same, or something later.
         """
