@@ -67,7 +67,7 @@ class AuditPlan:
 
 @dataclass(frozen=True)
 class AuditResult:
-    """What an audit found: ``comparisons`` names the schemes that are there to compare with."""
+    """What an audit measured: ``comparisons`` names the schemes that are there to compare with."""
 
     outcomes: list[AttackOutcome]
     schemes: list[dict[str, Any]]
@@ -234,7 +234,7 @@ def _known(
         rows += [population.owners.enrolled, population.owners.fresh]
         names += 2 * [f"owner {number}" for number in range(len(population.owners))]
     for more in beside:
-        rows.append(more.descriptors)
+        rows.append(more.embeddings)
         names += more.people
     # A photo of a person without a name is taken for one of a person of its own.
     return np.concatenate(rows), [name or f"\0{number}" for number, name in enumerate(names)]

@@ -135,7 +135,7 @@ class Testbed:
         What decides about probes, calibrated on people who are not attacked. None where attacks
         guess embeddings only.
     albums
-        Embeddings of all photos, (i, n), of each victim who has three or more.
+        Embeddings of all photos, (i, n), of each victim with three or more.
     owners
         People whose ``enrolled`` photos make up the pool of decoys.
     batches
@@ -240,7 +240,7 @@ class Testbed:
 
     @property
     def lifted(self) -> Calibration | None:
-        """The calibration of lifted probes, of the largest dimension; None where there is none.
+        """The calibration of lifted probes, of the largest dimension; None without any.
 
         The largest is where lifted wolves open most (docs/method.md §4.7).
         """

@@ -4,4 +4,4 @@ from templates.errors import VeilfaceError
 
 
 class AuditError(VeilfaceError):
-    """An attack or an audit that cannot be made as it was asked for."""
+    """An attack or an audit that cannot be made as it was ordered."""

@@ -22,7 +22,7 @@ class FurtherFaces:
     ----------
     name
         Of the folder or file that they are from.
-    descriptors : (A, n) float32
+    embeddings : (A, n) float32
         Unit rows.
     people
         A names; the empty name where it is not known who is shown.
@@ -31,18 +31,18 @@ class FurtherFaces:
     """
 
     name: str
-    descriptors: NDArray[np.float32]
+    embeddings: NDArray[np.float32]
     people: tuple[str, ...]
     left_out: int = 0
 
     def to_json(self) -> dict[str, Json]:
         """Return an entry of ``further_attacker_faces`` of the report's settings."""
-        return {"name": self.name, "faces": len(self.descriptors), "left_out": self.left_out}
+        return {"name": self.name, "faces": len(self.embeddings), "left_out": self.left_out}
 
 
 def strangers_among(
     further: FurtherFaces,
-    descriptors: NDArray[np.float32],
+    embeddings: NDArray[np.float32],
     identities: Sequence[str],
     attacked: Collection[str],
 ) -> FurtherFaces:
@@ -50,7 +50,7 @@ def strangers_among(
 
     Parameters
     ----------
-    descriptors, identities : (N, n) float32, N names
+    embeddings, identities : (N, n) float32, N names
         The audited set.
     attacked
         Names of the victims, all of whose photos are compared.
@@ -60,21 +60,21 @@ def strangers_among(
     AuditError
         Embeddings of another dimension.
     """
-    if further.descriptors.shape[1] != descriptors.shape[1]:
+    if further.embeddings.shape[1] != embeddings.shape[1]:
         raise AuditError(
-            f"{further.name} has embeddings of {further.descriptors.shape[1]} numbers, and the "
-            f"audited pack's have {descriptors.shape[1]}: embed it with the same pack"
+            f"{further.name} has embeddings of {further.embeddings.shape[1]} numbers, and the "
+            f"audited pack's have {embeddings.shape[1]}: embed it with the same pack"
         )
     names = np.asarray(identities, dtype=np.str_)
-    photos = descriptors[np.isin(names, list(attacked))]
+    photos = embeddings[np.isin(names, list(attacked))]
     stranger = np.array([name not in attacked for name in further.people], dtype=np.bool_)
     for start in range(0, len(stranger), _TILE):
         rows = slice(start, start + _TILE)
-        nearest = (further.descriptors[rows] @ photos.T).max(axis=1, initial=-1.0)
+        nearest = (further.embeddings[rows] @ photos.T).max(axis=1, initial=-1.0)
         stranger[rows] &= nearest < SAME_PHOTO
     return replace(
         further,
-        descriptors=further.descriptors[stranger],
+        embeddings=further.embeddings[stranger],
         people=tuple(np.asarray(further.people, dtype=np.str_)[stranger].tolist()),
         left_out=int(np.count_nonzero(~stranger)),
     )

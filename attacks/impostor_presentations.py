@@ -1,4 +1,4 @@
-"""Impostor attack presentations: a photo of an enrolled person, held before the camera.
+"""Impostor attack presentations: a photo of an enrolled person before the camera.
 
 The whole verification is attacked: people are enrolled by their live photos, and the attacker
 shows what a set holds of the same person (ISO/IEC 30107-3, IAPMR).

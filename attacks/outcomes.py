@@ -17,7 +17,7 @@ class Property(StrEnum):
     """What an attack breaks: the properties of ISO/IEC 24745, and one beside them."""
 
     IRREVERSIBILITY = "irreversibility"
-    """Nobody gets the descriptor, or a face, out of a template."""
+    """Nobody gets the embedding, or a face, out of a template."""
     UNLINKABILITY = "unlinkability"
     """Nobody tells whether two templates, of two tenants, are of one person."""
     RENEWABILITY = "renewability"
@@ -52,7 +52,7 @@ class KnowledgeLevel(StrEnum):
     """
 
     TEMPLATE = "template"
-    """One template, and that descriptors are of unit length."""
+    """One template, and that embeddings are of unit length."""
     ALGORITHM = "algorithm"
     """How templates are lifted, the model, the decoy generator (clients have it), other faces."""
     DECOYS = "decoys"
@@ -113,7 +113,7 @@ RAW = "raw"
 
 @dataclass(frozen=True)
 class Scheme:
-    """A way of protecting descriptors.
+    """A way of protecting embeddings.
 
     Parameters
     ----------
@@ -202,10 +202,10 @@ class AttackOutcome:
         How often guessing would have: the level's FMR, or the majority class.
     unjudged
         Why the verdict does not count it, as the end of a sentence that begins "not judged:";
-        None where it does. ``CONTROL`` for a control, ``COMPARED`` where it is none of the audited
+        None where it does. ``CONTROL`` for a control, ``COMPARED`` where it is not of the audited
         scheme.
     details
-        Further figures, JSON values. Never a number of a descriptor or a template.
+        Further figures, JSON values. Never a number of an embedding or a template.
     """
 
     attack: str

@@ -39,7 +39,7 @@ class Population:
     names
         Their A names.
     albums
-        Embeddings of all photos, (i, n), of each victim who has three or more.
+        Embeddings of all photos, (i, n), of each victim with three or more.
     victim_names
         Of all victims.
     """
@@ -53,13 +53,13 @@ class Population:
 
 
 def draw_population(
-    descriptors: Array, identities: Sequence[str], *, victims: int, owners: int, seed: int
+    embeddings: Array, identities: Sequence[str], *, victims: int, owners: int, seed: int
 ) -> Population:
     """Divide the people of a labelled folder into groups, at random.
 
     Parameters
     ----------
-    descriptors : (N, n) floating
+    embeddings : (N, n) floating
         Unit rows.
     victims, owners
         How many; of people with two photos or more.
@@ -69,7 +69,7 @@ def draw_population(
     AuditError
         There are too few people, or too few with two photos.
     """
-    rows = unit_descriptors(descriptors)
+    rows = unit_descriptors(embeddings)
     people, person_of = np.unique(np.asarray(identities, dtype=np.str_), return_inverse=True)
     if len(person_of) != len(rows):
         raise AuditError(f"{len(identities)} names do not fit {len(rows)} embeddings")
@@ -107,7 +107,7 @@ def without_decoy_people(population: Population, *, seed: int) -> tuple[Array, P
 
     Returns
     -------
-    descriptors : (D, n) float32
+    embeddings : (D, n) float32
         Their photos.
     population
         Without them among the others.

@@ -144,7 +144,7 @@ def likeliest_embeddings(templates: SubspaceBatch, faces: Moments, decoys: Momen
     Let Λ_f, Λ_w be the inverse second moments. A normalised Gaussian has the density
     (xᵀΛ_f x)^(−k/2) on the sphere. The span S of x and m further draws has, given x, the density
     of the matrix angular central Gaussian of S modulo x, which is (xᵀΛ_w x)^((k − 1 − m)/2) by the
-    Schur complement, but for factors without x [1]_. The guess maximises
+    Schur complement, up to factors without x [1]_. The guess maximises
 
         xᵀΛ_w x / xᵀΛ_f x   over x in S,
 

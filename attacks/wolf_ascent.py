@@ -93,8 +93,8 @@ def _ascend(foot: Array32, basis: Array32, ground: Ground) -> tuple[Array32, Arr
     v: Array32 | None = None
     for number, step in enumerate(step_lengths(ROUNDS)):
         # The best v moves little in a step: it is searched for anew now and then only.
-        again = None if number % _SEARCH_EVERY == 0 else v
-        similarities, v, nearest = _closest(foot, basis, radius, ground, again)
+        known = None if number % _SEARCH_EVERY == 0 else v
+        similarities, v, nearest = _closest(foot, basis, radius, ground, known)
         values, slopes = ground.slopes(similarities[None])
         if values[0] > best_value:
             best_foot, best_basis, best_value = foot, basis, float(values[0])

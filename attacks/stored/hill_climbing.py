@@ -1,8 +1,8 @@
-"""Getting accepted by asking the service again and again, by who may see its scores.
+"""Getting accepted by repeated probes, with the right to see the service's scores.
 
 The climber learns from templates of its own before it asks, so that every answer counts: it knows
 how templates are lifted, lifts faces of its own, and sees how the scores of two probes go together
-over templates. No other template than the one that is asked about is used.
+over templates. It uses no other template than the one that it attacks.
 """
 
 from collections.abc import Callable, Iterator

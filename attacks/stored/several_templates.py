@@ -1,6 +1,6 @@
 """Several templates of one person: of the same photos, of some of them, and of others.
 
-The service draws the decoys of the same photos under a secret: enrolled again, they give the same
+The service draws the decoys of the same photos under a secret: a new enrollment gives the same
 template in another rotation. Two secrets give two lifts, which come near each other in the
 embedding: what two tenants, or two names, have of a person who keeps a key and gave both the same
 photos. Photos that overlap those of an earlier enrollment give two lifts of nearly one embedding,

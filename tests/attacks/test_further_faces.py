@@ -15,7 +15,7 @@ def test_victims_are_left_out_by_name_and_by_photo() -> None:
         "more", np.stack([again, rows[4], rows[2], rows[5]]), ("", "ada", "bea", "")
     )
     kept = strangers_among(further, rows[:4], names, {"ada"})
-    np.testing.assert_array_equal(kept.descriptors, np.stack([rows[2], rows[5]]))
+    np.testing.assert_array_equal(kept.embeddings, np.stack([rows[2], rows[5]]))
     assert (kept.people, kept.left_out) == (("bea", ""), 2)
     assert kept.to_json() == {"name": "more", "faces": 2, "left_out": 2}
 
