@@ -6,9 +6,9 @@ lifted once each and verified against the person (genuine) and all others (impos
 private client then does the same with the same photos. An enrollment that is refused counts as
 failed genuine attempts. Then every person stands before a fake camera, and ``<veilface-login>`` is
 timed from the click to its answer; and so is the service's own page in private mode, from the
-shutter, with *Verify* pressed as soon as it can be. Every byte that the browser sends goes through
+press of *Verify*, which takes the photos too. Every byte that the browser sends goes through
 a recording proxy, no other host has an address for it, and the recording is searched for the
-photos, what the camera showed, and their descriptors; those that are sent on purpose afterwards
+photos, what the camera showed, and their embeddings; those that are sent on purpose afterwards
 must be found.
 
 Needs Chromium and the built client (``make javascript``).
@@ -16,7 +16,6 @@ Needs Chromium and the built client (``make javascript``).
 
 import argparse
 import base64
-import json
 import re
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -24,19 +23,15 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from types import MappingProxyType
 from typing import Any
 
-import numpy as np
 from playwright.sync_api import BrowserContext, Locator, expect, sync_playwright
 
 from benchmarks import deployment
 from benchmarks.people import AttemptCounts, Person, attempt_all, impostor_attempts, people_of
-from models.decoding import decode_image
-from models.errors import FaceError
 from models.pack import ModelPack
-from models.selection import FacePolicy
 from tests.clients.proxy import Proxy
+from tests.clients.recorded import faces_of, requests_in
 from tests.leaks import LeakSearch
 from tests.patience import PATIENCE_S
 from tests.web.browser_tab import BrowserTab
@@ -53,10 +48,10 @@ PLANTED = {
     "base64 of a photo": ("photo", "base64"),
     "decoded pixels": ("pixels", "bytes"),
     "aligned crop": ("crop", "bytes"),
-    "float32": ("descriptor", "float32"),
-    "float64": ("descriptor", "float64"),
-    "base64 of float32": ("descriptor", "base64"),
-    "decimal text": ("descriptor", "decimals"),
+    "float32": ("embedding", "float32"),
+    "float64": ("embedding", "float64"),
+    "base64 of float32": ("embedding", "base64"),
+    "decimal text": ("embedding", "decimals"),
 }
 """What is sent on purpose: what must be found of it, and how the form of the leak begins."""
 SHUTTER = """async () => {
@@ -74,8 +69,8 @@ SHUTTER = """async () => {
   const since = (start) => (performance.now() - start) / 1000;
   const start = performance.now();
   const buttons = [...document.querySelectorAll("form button")];
-  buttons.find(({ textContent }) => textContent === "Take 3 photos").click();
-  (await there(() => document.querySelector("form button[type=submit]:enabled"))).click();
+  buttons.find(({ type }) => type === "submit").click();
+  await there(() => document.querySelector(".tray li"));
   const taken = since(start);
   const answer = await there(() => document.querySelector(".verdict, [role=alert]"));
   const accepted = answer.matches(".accept");
@@ -83,9 +78,6 @@ SHUTTER = """async () => {
   return { seconds: since(start), taken, accepted, error };
 }"""
 """Takes a burst and verifies it; when the photos were taken, and when the answer was there."""
-_REQUEST = re.compile(rb"([A-Z]+) (/\S*) HTTP/1\.1\r\n(.*?)\r\n\r\n", re.DOTALL)
-_NAMED = re.compile(rb"^(/v1/subjects/|/v1/pack/|/photos/)[^/]+|^(/client/|/ort/).+")
-_LENGTH = re.compile(rb"^content-length: (\d+)", re.IGNORECASE | re.MULTILINE)
 
 
 @dataclass
@@ -242,50 +234,18 @@ def _step_before(tab: BrowserTab, subject: str) -> Locator:
     tab.open("Service")
     tab.open("Verify")
     expect(tab.page.get_by_role("switch", name="Private mode")).to_be_checked()
-    tab.page.get_by_label("Person's id").fill(subject)
+    tab.name_person(subject)
     # Some of these photos have others in their background.
+    tab.page.get_by_text("Options").click()
     tab.page.get_by_label("Others are in the picture").check()
-    tab.page.get_by_role("button", name="Start camera").click()
+    tab.press("Start camera")
     guidance = tab.page.locator(".guidance")
     expect(guidance).to_have_attribute("data-state", re.compile("good|bad"))
     return guidance
 
 
-def faces_of(
-    pack: ModelPack, people: Sequence[Person], shown: Mapping[str, bytes] = MappingProxyType({})
-) -> LeakSearch:
-    """What must not be found: files, pixels, crops and descriptors of all photos, and of more."""
-    photos = {
-        photo.name: photo.read_bytes()
-        for person in people
-        for photo in (*person.enroll, *person.probes)
-    }
-    vectors: dict[str, Any] = {}
-    strings: dict[str, bytes] = {}
-    for name, data in {**photos, **shown}.items():
-        pixels = decode_image(data)
-        opaque = np.full((*pixels.shape[:2], 1), 255, dtype=np.uint8)
-        strings[f"photo {name}"] = data
-        strings[f"pixels {name}"] = pixels.tobytes()
-        strings[f"pixels with alpha {name}"] = np.dstack([pixels, opaque]).tobytes()
-        try:
-            crop = pack.crop_photo(data, policy=FacePolicy.LARGEST).crop
-        except FaceError:
-            continue
-        strings[f"crop {name}"] = crop.tobytes()
-        vectors[f"descriptor {name}"] = pack.embed(crop[None])[0]
-    for person in people:
-        names = [f"descriptor {photo.name}" for photo in person.enroll]
-        rows = [vectors[name] for name in names if name in vectors]
-        if rows:
-            mean = np.mean(rows, axis=0)
-            vectors[f"mean of {person.name}"] = mean
-            vectors[f"unit mean of {person.name}"] = mean / np.linalg.norm(mean)
-    return LeakSearch(vectors=vectors, strings=strings)
-
-
 def planted_and_missed(opened: Visit, photo: Path, search: LeakSearch) -> list[str]:
-    """Send this photo and its descriptor in every form; those that the search did not find."""
+    """Send this photo and its embedding in every form; those that the search did not find."""
     (name,) = opened.show([photo])
     missed = []
     for planted, (kind, form) in PLANTED.items():
@@ -295,33 +255,6 @@ def planted_and_missed(opened: Visit, photo: Path, search: LeakSearch) -> list[s
         if not any(leak.what == f"{kind} {name}" and leak.form.startswith(form) for leak in leaks):
             missed.append(planted)
     return missed
-
-
-def requests_in(recording: bytes) -> tuple[dict[str, dict[str, object]], int]:
-    """Count requests by what they ask for, with the members and bytes of their bodies.
-
-    Also returns how many bytes are part of no request; the proxy's line ends between connections
-    are none of the browser's.
-    """
-    bodies: dict[str, list[bytes]] = {}
-    rest = end = 0
-    for head in _REQUEST.finditer(recording):
-        path = _NAMED.sub(rb"\1\2*", head[2])
-        length = _LENGTH.search(head[3])
-        body = recording[head.end() : head.end() + int(length[1])] if length else b""
-        bodies.setdefault(f"{head[1].decode()} {path.decode()}", []).append(body)
-        rest += len(recording[end : head.start()].strip(b"\n"))
-        end = head.end() + len(body)
-    rest += len(recording[end:].strip(b"\n"))
-    calls: dict[str, dict[str, object]] = {
-        call: {
-            "times": len(each),
-            "members": sorted({name for body in each if body for name in json.loads(body)}),
-            "bytes_of_a_body_at_most": max(map(len, each)),
-        }
-        for call, each in sorted(bodies.items())
-    }
-    return calls, rest
 
 
 @contextmanager
@@ -378,7 +311,9 @@ def measure(args: argparse.Namespace) -> list[dict[str, object]]:
         by_page = by_the_shutter(second, camera, there, level=level)
         sent = served.recording.sent + recording.sent
         calls, rest = requests_in(sent)
-        search = faces_of(pack, people, shown)
+        more = {photo.name: photo.read_bytes() for person in people for photo in person.probes}
+        enrolled = {person.name: person.enroll for person in people}
+        search = faces_of(pack, enrolled, {**more, **shown})
         leaks = search.find(sent)
         missed = planted_and_missed(opened, people[0].probes[0], search)
         tabs = [first.tab, opened.tab, looked, second]

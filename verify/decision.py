@@ -31,6 +31,8 @@ class Decision:
         For keys with the right to them: returned to anyone else they let an attacker
         climb (docs/method.md §4.8). Left out of ``repr``, so that no log line holds them by
         accident.
+    distance_threshold
+        The distance at which this very probe reaches the level's threshold, which is of scores.
     liveness
         Whether a living person made the probe, where that was checked.
     liveness_failure
@@ -48,6 +50,7 @@ class Decision:
     similarity: float = field(repr=False)
     distance: float = field(repr=False)
     score: float = field(repr=False)
+    distance_threshold: float = field(repr=False)
     liveness: Liveness = "not_checked"
     liveness_failure: LivenessFailure | None = None
     advice: str | None = None

@@ -1,5 +1,6 @@
 """A probe against a stored template becomes a decision."""
 
+import math
 import secrets
 from collections.abc import Callable
 from typing import Protocol
@@ -218,7 +219,10 @@ class Verifier:
         means, spreads = expected_similarity(
             probe, self._nobody, metric=calibration.metric, steps=calibration.steps
         )
-        score = (close - float(means[0])) / float(spreads[0])
+        mean, spread = float(means[0]), float(spreads[0])
+        score = (close - mean) / spread
+        # The similarity that the threshold asks of this probe, as a distance again.
+        least = mean + level.threshold * spread
         # NaN reaches no threshold, so no input is accepted by an exception. A stand-in never is,
         # and neither is a probe without the key that its template needs, not even by chance.
         could_match = not unknown and (has_key or stored.holder_salt is None)
@@ -233,4 +237,5 @@ class Verifier:
             similarity=close,
             distance=distance,
             score=score,
+            distance_threshold=math.sqrt(max(0.0, 2 * (1 - least))),
         )

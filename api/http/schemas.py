@@ -101,6 +101,11 @@ class VerifyAnswer(_Answer):
     distance: float | None = Field(
         None, description="Only for keys with `scores` and `enroll`.", exclude_if=_is_none
     )
+    distance_threshold: float | None = Field(
+        None,
+        description="The largest distance at which this probe is accepted: only beside `distance`.",
+        exclude_if=_is_none,
+    )
     liveness_failure: LivenessFailure | None = Field(
         None,
         description="Why liveness failed: only for keys with `scores` and `enroll`.",

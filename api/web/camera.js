@@ -1,8 +1,7 @@
-// The camera, with live guidance: about one small frame a second is asked about, and slower where
-// the service says so. The photos that count are taken at full size, a burst of three when the
-// visitor says so, and each is asked about meanwhile.
+// The camera, with live guidance: about one small frame a second is asked about, and slower where the service
+// says so. The photos that count are taken at full size, a burst of three, and each is asked about meanwhile.
 
-import { faceBox, h } from "./dom.js";
+import { faceBox, h, s } from "./dom.js";
 import { Problem, call, crops, form, session } from "./service.js";
 import { cameraTrouble, guidance, sentence } from "./words.js";
 
@@ -10,11 +9,9 @@ const EVERY_MS = 1000;
 const FRAME = 480;
 const PHOTO = 1280;
 const QUALITY = 0.92;
+export const BURST = 3;
 // Apart enough for another moment of the face, and over before anyone moves.
-const BURST = 3;
 const APART_MS = 300;
-const TAKE = `Take ${BURST} photos`;
-const OFF = "The camera is off.";
 
 // A picture of at most `side` pixels as JPEG, its middle square where that is asked for.
 export async function picture(source, width, height, { side, quality = QUALITY, square = false }) {
@@ -36,18 +33,19 @@ export const check = (blob, face, signal) =>
     : call("POST", "/v1/photos/check", { body: form("image", [blob], { face }), signal });
 
 // The service could not be asked; that says nothing of the photo.
-export const unasked = ({ status, code }) =>
-  code !== "page_error" && (!status || status === 429 || status >= 500);
+export const unasked = ({ status, code }) => code !== "page_error" && (!status || status === 429 || status >= 500);
 
 export const after = (ms) => new Promise((done) => setTimeout(done, ms));
 
-const release = (stream) => stream?.getTracks().forEach((each) => each.stop());
+const release = (stream) => stream?.getTracks().forEach((track) => track.stop());
 
-// The picture of the visitor's camera, mirrored, with what lies over it.
-export function viewfinder(overlay) {
-  const video = h("video", { playsinline: true, muted: true, "aria-label": "Your camera" });
+// The picture of the visitor's camera, mirrored, in an outline for the face, with what lies over it.
+export function viewfinder(...overlays) {
+  const video = h("video", { playsinline: true, muted: true, hidden: true, "aria-label": "Your camera" });
   video.muted = true;
-  const root = h("div", { class: "viewfinder", hidden: true }, video, overlay);
+  const outline = s("ellipse", { class: "outline", cx: "50", cy: "50", rx: "21", ry: "38" });
+  const shape = { class: "overlay", viewBox: "0 0 100 100", preserveAspectRatio: "none", "aria-hidden": "true" };
+  const root = h("div", { class: "viewfinder" }, video, s("svg", shape, outline), overlays);
   return {
     root,
     // Runs until `signal` ends. `lost` is called where it is unplugged, forbidden, or taken by another program.
@@ -56,7 +54,7 @@ export function viewfinder(overlay) {
       signal.addEventListener("abort", () => {
         release(stream);
         video.srcObject = null;
-        root.hidden = true;
+        video.hidden = true;
       });
       try {
         if (!navigator.mediaDevices) throw new Error("insecure");
@@ -77,59 +75,54 @@ export function viewfinder(overlay) {
       video.srcObject = stream;
       await video.play().catch(() => {});
       signal.throwIfAborted();
-      root.hidden = false;
+      video.hidden = false;
     },
-    isOn: () => video.videoWidth > 0,
+    isOn: () => video.videoWidth > 0 && !video.hidden,
     shot: (options) => picture(video, video.videoWidth, video.videoHeight, options),
   };
 }
 
-// `onburst(photos)` gets the photos of a burst that would do, as {blob, name, seen}: `seen`
-// is what the service saw, or null where it could not be asked; `face()` says which face counts.
-export function camera({ onburst, face }) {
+// `burst()` resolves to the photos that would do, as {blob, name, seen}: `seen` is what the service saw, or null where
+// it could not be asked. `face()` says which face counts; `onchange` is called where the camera goes on or off.
+export function camera({ face, onchange }) {
   const { overlay, mark } = faceBox();
   const finder = viewfinder(overlay);
-  const said = h("p", { class: "guidance", role: "status", "data-state": "idle" }, OFF);
-  const start = h("button", { type: "button", class: "secondary", onclick: begin }, "Start camera");
-  const take = h("button", { type: "button", hidden: true, onclick: burst }, TAKE);
+  const guide = h("p", { class: "guidance", role: "status", "data-state": "idle" }, "The camera is off.");
   const refused = h("p", { class: "refused", role: "status" });
   let running = new AbortController();
+  running.abort();
+  let taking = false;
 
   function say(text, state) {
     // Only what changed is read out.
-    if (said.textContent !== text) said.textContent = text;
-    said.dataset.state = state;
+    if (guide.textContent !== text) guide.textContent = text;
+    guide.dataset.state = state;
   }
 
   async function begin() {
     running.abort();
     running = new AbortController();
     const { signal } = running;
-    start.disabled = true;
     refused.textContent = "";
     try {
       await finder.open(signal, lost);
     } catch (error) {
-      start.disabled = false;
       if (!signal.aborted) say(`${sentence(error.message)} You can also choose files.`, "bad");
       return;
     }
-    take.hidden = false;
-    start.hidden = true;
-    take.focus();
     say("Looking for a face…", "idle");
-    guide(signal);
+    onchange();
+    look(signal);
   }
 
-  async function guide(signal) {
+  async function look(signal) {
     while (!signal.aborted) {
       const begun = Date.now();
       let pause = EVERY_MS;
       // Photos go first.
-      if (!document.hidden && finder.isOn() && !take.matches(":disabled")) {
+      if (!document.hidden && finder.isOn() && !taking && !guide.closest("fieldset:disabled")) {
         try {
           const small = await snap(FRAME, 0.8);
-          if (signal.aborted) return;
           const seen = await check(small.blob, face(), signal);
           if (signal.aborted) return;
           say(guidance(seen), seen.usable ? "good" : "bad");
@@ -137,8 +130,7 @@ export function camera({ onburst, face }) {
         } catch (error) {
           if (signal.aborted) return;
           mark(null);
-          const known = error instanceof Problem;
-          pause = 1000 * Math.max(2, (known && error.wait) || 0);
+          pause = 1000 * Math.max(2, (error instanceof Problem && error.wait) || 0);
           say(
             error.code === "rate_limited"
               ? "Guidance is paused: too many requests. You can still take a photo."
@@ -167,49 +159,43 @@ export function camera({ onburst, face }) {
 
   async function burst() {
     const { signal } = running;
-    take.disabled = true;
-    take.textContent = "Hold still…";
+    taking = true;
     refused.textContent = "";
+    say("Hold still…", "idle");
     const good = [];
     let why = null;
-    let judged = Promise.resolve();
     try {
+      const judged = [];
       for (let shot = 0; shot < BURST; shot++) {
         if (shot) await after(APART_MS);
-        if (signal.aborted) return;
+        signal.throwIfAborted();
         const photo = { blob: (await snap(PHOTO, QUALITY)).blob, name: "camera", seen: null };
-        judged = judged.then(async () => {
-          const not = await judge(photo, signal);
-          if (not) why ??= not;
+        const before = judged.at(-1);
+        judged.push(Promise.resolve(before).then(() => judge(photo, signal)).then((reason) => {
+          if (reason) why ??= reason;
           else good.push(photo);
-        });
-        judged.catch(() => {});
+        }));
       }
-      await judged;
+      await Promise.all(judged);
     } catch (error) {
-      if (signal.aborted) return;
-      if (!(error instanceof Problem)) throw error;
+      if (!signal.aborted && !(error instanceof Problem)) throw error;
       why = sentence(error.message);
     } finally {
-      take.disabled = false;
-      take.textContent = TAKE;
+      taking = false;
     }
-    if (signal.aborted) return;
-    // Unless the visitor went on meanwhile; a button that is switched off loses the focus.
-    if (document.activeElement === document.body) take.focus();
+    if (signal.aborted) return [];
+    say(why ? "Looking for a face…" : "Photos taken.", "idle");
     if (why) refused.textContent = `${good.length || "None"} of ${BURST} photos taken. ${why}`;
-    if (good.length) onburst(good);
+    return good;
   }
 
   function lost() {
-    const focused = document.activeElement === take;
     running.abort();
-    take.hidden = true;
-    start.hidden = start.disabled = false;
-    if (focused) start.focus();
     say("The camera has stopped. Start it again, or choose files.", "bad");
+    onchange();
   }
 
-  const root = h("div", { class: "camera" }, finder.root, said, h("div", { class: "row" }, start, take), refused);
-  return { root, stop: () => running.abort() };
+  finder.root.append(guide);
+  const root = h("div", { class: "camera" }, finder.root, refused);
+  return { root, begin, burst, isOn: () => !running.signal.aborted && finder.isOn(), stop: () => running.abort() };
 }

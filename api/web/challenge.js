@@ -1,8 +1,8 @@
-// A challenge of head movements: the page says each by the clock, and takes frames meanwhile. It does
-// not wait until it sees one: a recording that shows all movements in turn would be waited for, too.
+// A challenge of head movements: the page says each by the clock, and takes frames meanwhile. It does not wait until it
+// sees one: a recording that shows all movements in turn would be waited for, too.
 
 import { after, viewfinder } from "./camera.js";
-import { h, s } from "./dom.js";
+import { h } from "./dom.js";
 import { Problem, call } from "./service.js";
 import { FRONT, MOVE_BACK, MOVEMENTS } from "./words.js";
 
@@ -14,22 +14,16 @@ const BACK_MS = 1300;
 
 // `frames(subject)` resolves to {challenge_id, photos}.
 export function headMovements() {
-  const outline = s("ellipse", { class: "outline", cx: "50", cy: "50", rx: "21", ry: "40" });
-  const overlay = s(
-    "svg",
-    { class: "overlay", viewBox: "0 0 100 100", preserveAspectRatio: "none", "aria-hidden": "true" },
-    outline,
-  );
-  const finder = viewfinder(overlay);
   const arrow = h("span", { class: "arrow", "aria-hidden": "true" });
   const words = h("span", {});
-  const told = h("p", { class: "movement", role: "status", "aria-live": "assertive", hidden: true }, arrow, words);
+  const movement = h("p", { class: "movement", role: "status", "aria-live": "assertive", hidden: true }, arrow, words);
+  const finder = viewfinder(movement);
   let running = new AbortController();
 
   function say(name) {
     [words.textContent, arrow.textContent] = MOVEMENTS[name];
-    told.dataset.movement = name;
-    told.hidden = false;
+    movement.dataset.movement = name;
+    movement.hidden = false;
   }
 
   async function frames(subject) {
@@ -50,10 +44,10 @@ export function headMovements() {
         signal,
       });
       const photos = [await snap(signal)];
-      for (const movement of challenge.movements) {
-        say(movement);
+      for (const asked of challenge.movements) {
+        say(asked);
         for (const wait of OUT_MS) photos.push(await snap(signal, wait));
-        say(movement === "come_closer" ? MOVE_BACK : FRONT);
+        say(asked === "come_closer" ? MOVE_BACK : FRONT);
         photos.push(await snap(signal, BACK_MS));
       }
       return { challenge_id: challenge.challenge_id, photos };
@@ -61,7 +55,7 @@ export function headMovements() {
       throw signal.reason instanceof Problem ? signal.reason : error;
     } finally {
       run.abort();
-      if (running === run) told.hidden = true;
+      if (running === run) movement.hidden = true;
     }
   }
 
@@ -74,14 +68,13 @@ export function headMovements() {
   const root = h(
     "div",
     { class: "head-movements" },
+    finder.root,
     h(
       "p",
       { class: "hint" },
-      "The page will ask for three head movements and take frames of them, for about twelve seconds. Keep your face inside the outline.",
+      "You are asked for three head movements, for about twelve seconds. Keep your face inside the outline. ",
+      "If you cannot turn your head, ask the operator for another way.",
     ),
-    told,
-    finder.root,
-    h("p", { class: "hint" }, "If you cannot turn your head, ask the operator for another way."),
   );
   return { root, frames, stop: () => running.abort() };
 }

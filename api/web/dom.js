@@ -3,25 +3,23 @@
 const SVG = "http://www.w3.org/2000/svg";
 
 function fill(node, attributes, children) {
-  for (const [name, value] of Object.entries(attributes ?? {})) {
+  for (const [name, value] of Object.entries(attributes)) {
     if (value === null || value === undefined || value === false) continue;
     if (name.startsWith("on")) node.addEventListener(name.slice(2), value);
     else if (name === "value") node.value = value;
     else node.setAttribute(name, value === true ? "" : value);
   }
-  node.append(...children.flat().filter((each) => each !== null && each !== undefined));
+  node.append(...children.flat(Infinity).filter((child) => child !== null && child !== undefined));
   return node;
 }
 
-export const h = (tag, attributes, ...children) =>
-  fill(document.createElement(tag), attributes, children);
+export const h = (tag, attributes, ...children) => fill(document.createElement(tag), attributes, children);
 
-export const s = (tag, attributes, ...children) =>
-  fill(document.createElementNS(SVG, tag), attributes, children);
+export const s = (tag, attributes, ...children) => fill(document.createElementNS(SVG, tag), attributes, children);
 
 // A command, not broken within an option.
 export const command = (text) =>
-  h("code", {}, text.split(" ").map((word) => [h("span", {}, word), " "]).flat().slice(0, -1));
+  h("code", {}, text.split(" ").flatMap((word) => [" ", h("span", {}, word)]).slice(1));
 
 let last = 0;
 export const newId = (name) => `${name}-${++last}`;
@@ -38,17 +36,63 @@ export function field(label, control, hint) {
   return h("div", { class: "field" }, parts);
 }
 
+// One of several: radio buttons in a row. `choices` has a label by each value; `off` those that cannot be chosen.
+export function choice(legend, choices, { value, onchange, off = [], describedby }) {
+  const name = newId("choice");
+  const radios = Object.keys(choices).map((each) =>
+    h("input", {
+      type: "radio",
+      name,
+      id: newId("choice"),
+      value: each,
+      checked: each === value,
+      disabled: off.includes(each),
+      "aria-describedby": off.includes(each) ? describedby : null,
+      onchange: () => onchange(each),
+    }),
+  );
+  const root = h(
+    "fieldset",
+    { class: "choice" },
+    h("legend", {}, legend),
+    radios.map((radio) => h("span", {}, radio, h("label", { for: radio.id }, choices[radio.value]))),
+  );
+  return {
+    root,
+    value: () => radios.find((radio) => radio.checked).value,
+    choose: (each) => (radios.find((radio) => radio.value === each).checked = true),
+  };
+}
+
+// A place to choose a file, or to drop one on, for an input whose own looks are hidden.
+export function dropZone(input, title, hint) {
+  const name = h("strong", {}, title);
+  const over = (event) => {
+    event.preventDefault();
+    event.stopPropagation();
+  };
+  const show = () => (name.textContent = input.files[0]?.name ?? title);
+  input.addEventListener("change", show);
+  const drop = (event) => {
+    over(event);
+    input.files = event.dataTransfer.files;
+    show();
+  };
+  const zone = { class: "drop", for: input.id, ondragover: over, ondrop: drop };
+  return [input, h("label", zone, name, h("span", { class: "hint" }, hint))];
+}
+
 // A box around a face, over a picture that fills its frame.
 export function faceBox() {
   const box = s("rect", { class: "found", hidden: true });
   const overlay = s("svg", { class: "overlay", preserveAspectRatio: "xMidYMid slice", "aria-hidden": "true" }, box);
-  // `found` is x1, y1, x2, y2 in pixels of a picture of this size, or null.
-  const mark = (found, width, height) => {
-    box.toggleAttribute("hidden", !found);
-    if (!found) return;
+  // `corners` are x1, y1, x2, y2 in pixels of a picture of this size, or null.
+  const mark = (corners, width, height) => {
+    box.toggleAttribute("hidden", !corners);
+    if (!corners) return;
     overlay.setAttribute("viewBox", `0 0 ${width} ${height}`);
-    const [x, y, right, bottom] = found;
-    const places = { x, y, width: right - x, height: bottom - y, rx: width / 80 };
+    const [x, y, right, bottom] = corners;
+    const places = { x, y, width: right - x, height: bottom - y, rx: width / 40 };
     for (const [name, value] of Object.entries(places)) box.setAttribute(name, value);
   };
   return { overlay, mark };
@@ -65,23 +109,27 @@ export function facts(pairs) {
   );
 }
 
-const row = ([first, ...rest]) =>
-  h("tr", {}, h("th", { scope: "row" }, first), rest.map((each) => h("td", {}, each)));
-
-// A table that scrolls by itself where it is too wide; the keyboard reaches it.
+// A table, whose rows become cards on a narrow screen: each cell has the name of its column.
 export function table(caption, head, rows) {
-  return h(
-    "div",
-    { class: "scroll", tabindex: "0", role: "region", "aria-label": caption },
+  const row = ([first, ...rest]) =>
     h(
-      "table",
+      "tr",
       {},
-      h("caption", {}, caption),
-      h("thead", {}, h("tr", {}, head.map((each) => h("th", { scope: "col" }, each)))),
-      h("tbody", {}, rows.map(row)),
-    ),
+      h("th", { scope: "row" }, first),
+      rest.map((cell, index) => h("td", { "data-column": head[index + 1] }, cell)),
+    );
+  return h(
+    "table",
+    {},
+    h("caption", {}, caption),
+    h("thead", {}, h("tr", {}, head.map((name) => h("th", { scope: "col" }, name)))),
+    h("tbody", {}, rows.map(row)),
   );
 }
+
+// What few visitors need, behind a line that opens it.
+export const folded = (summary, ...content) =>
+  h("details", {}, h("summary", {}, summary), h("div", { class: "inside" }, content));
 
 // Ask in a modal dialog, with the focus on the answer that does nothing; resolves to whether the visitor agreed.
 // It closes unanswered when `signal` ends.
@@ -111,22 +159,29 @@ export function confirmed(title, text, verb, signal) {
   });
 }
 
+export const plural = (count, one, many) => `${count.toLocaleString("en")} ${count === 1 ? one : many}`;
+
 export const percent = (rate) =>
   rate === null || rate === undefined ? "unknown" : `${Number((100 * rate).toPrecision(3))} %`;
 
 export const oneIn = (rate) => (rate > 0 ? `1 in ${Math.round(1 / rate).toLocaleString("en")}` : "none seen");
 
-export function when(text) {
-  if (!text) return "never";
-  const time = new Date(text);
-  return h(
-    "time",
-    { datetime: text },
-    time.toLocaleString("en-GB", { dateStyle: "medium", timeStyle: "short" }),
-  );
+function ago(time) {
+  const seconds = Math.round((Date.now() - time) / 1000);
+  const units = [["d", 86400], ["h", 3600], ["min", 60], ["s", 1]];
+  const [unit, size] = units.find(([, size]) => seconds >= size) ?? ["s", 1];
+  if (seconds < 5) return "just now";
+  return seconds < 30 * 86400 ? `${Math.floor(seconds / size)} ${unit} ago` : null;
 }
 
-export const bytes = (count) => `${count.toLocaleString("en")} bytes`;
+// A time to the second, and where it is recent how long ago that was; `brief`: that alone.
+export function when(text, { brief = false } = {}) {
+  const time = new Date(text);
+  const exact = time.toLocaleString("en-GB", { dateStyle: "medium", timeStyle: "medium" });
+  const since = ago(time);
+  const shown = brief ? (since ?? exact) : since ? `${exact} · ${since}` : exact;
+  return h("time", { datetime: text, title: exact }, shown);
+}
 
 export function download(name, text, type = "application/json") {
   const url = URL.createObjectURL(new Blob([text], { type }));
@@ -134,6 +189,5 @@ export function download(name, text, type = "application/json") {
   setTimeout(() => URL.revokeObjectURL(url), 10000);
 }
 
-// Of a drag: whether it carries files, and whether what it is over takes them by itself.
+// Whether a drag carries files.
 export const carriesFiles = (event) => event.dataTransfer?.types.includes("Files") ?? false;
-export const takesFiles = (target) => target.closest?.("input[type=file]:enabled") != null;

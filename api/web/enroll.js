@@ -1,13 +1,36 @@
-import { confirmed, facts, h } from "./dom.js";
+import { confirmed, facts, h, plural } from "./dom.js";
 import { photoForm } from "./form.js";
 import { call, form, session, subjectPath } from "./service.js";
-import { SPELLING } from "./subject.js";
 
+// Photos that make a reliable login, by the figures of docs/thresholds.md.
+const ENOUGH = 3;
 const STEPS = [
-  "The service finds the face in each photo and says at once whether the photo will do.",
-  "Your model turns the faces into one embedding, which is hidden in a set that holds decoys as well.",
+  "The service finds the face in each photo, and says at once whether the photo will do.",
+  "The faces become one embedding, which is hidden in a set that holds decoys as well.",
   "Only that set is stored, encrypted. Photos and embedding are forgotten.",
 ];
+
+// Why a template of so few photos should not replace the one that there is, or null.
+const fewer = (count, person) =>
+  count > 0 && person?.enrolled_by === "photos" && person.photos > count
+    ? `${plural(count, "photo", "photos")} would replace ${person.photos}: the login becomes less reliable.`
+    : null;
+
+function progress(count, person) {
+  const lack = ENOUGH - count;
+  const dots = Array.from({ length: ENOUGH }, (_, index) => h("span", { class: index < count ? "dot full" : "dot" }));
+  const words =
+    count === 0
+      ? "Three photos make a reliable login."
+      : lack > 0
+        ? `${lack} more for a reliable login.`
+        : "✓ Enough for a reliable login.";
+  const warning = fewer(count, person);
+  return [
+    h("p", {}, h("span", { class: "dots", "aria-hidden": "true" }, dots), words),
+    warning ? h("p", { class: "warning" }, warning) : "",
+  ];
+}
 
 export function enrollView(id) {
   const ended = new AbortController();
@@ -29,9 +52,10 @@ export function enrollView(id) {
     } catch (error) {
       const known = error.code === "enrollment_conflict" && error.details.template_id;
       if (!known) throw error;
+      const person = await call("GET", subjectPath(name), { signal: ended.signal }).catch(() => null);
       const agreed = await confirmed(
         `Replace ${name}’s enrollment?`,
-        "This person is enrolled already. Enrolling again replaces their template and its lock.",
+        `Enrolling again replaces the template and its lock. ${fewer(photos.length, person) ?? ""}`,
         "Replace",
         ended.signal,
       );
@@ -42,15 +66,13 @@ export function enrollView(id) {
   return photoForm(id, {
     action: "enroll",
     title: "Enroll",
-    lead:
-      "One to ten photos of a person become one private template. " +
-      "Whoever is enrolled already is replaced only if you confirm it.",
-    idHint: `A new id (${SPELLING}), or whom to enroll again.`,
-    heading: "What happens to the photos",
-    steps: () => (session.mode?.active() ? session.mode.STEPS : STEPS),
+    lead: "Photos of one person become one private template.",
+    empty: () =>
+      h("ol", {}, (session.mode?.active() ? session.mode.STEPS : STEPS).map((step) => h("li", {}, step))),
     most: 10,
     always: true,
-    verb: () => "Enroll",
+    verb: "Enroll",
+    progress,
     send,
     show: enrolled,
     remedies: () => [],
@@ -59,21 +81,19 @@ export function enrollView(id) {
 }
 
 function enrolled(id, answer, { drop }) {
-  const photos = drop().map((each, index) =>
-    h("li", {}, each, ` Photo ${index + 1}: ${answer.images[index]?.status ?? "used"}`),
-  );
+  const photos = drop().map((thumb) => h("li", {}, thumb));
   return h(
     "div",
     { class: "verdict accept", tabindex: "-1" },
-    h("p", { class: "verdict-word" }, answer.replaced ? "Enrolled again" : "Enrolled"),
+    h("p", { class: "verdict-word" }, answer.replaced ? "✓ Enrolled again" : "✓ Enrolled"),
     h("ol", { class: "used", "aria-label": "Photos used" }, photos),
     facts([
       ["Person", id],
-      ["Photos used", String(answer.images.length)],
+      ["Photos used", String(photos.length)],
       ["Earlier enrollment", answer.replaced ? "replaced" : "none"],
       ["Holder key", answer.holder_key ? "needed at every verification" : null],
+      ["Template", h("code", {}, answer.template_id)],
     ]),
-    h("p", { class: "row" }, h("a", { href: `#/verify/${encodeURIComponent(id)}` }, "Verify this person")),
-    h("p", { class: "fine" }, "Template ", h("code", {}, answer.template_id)),
+    h("p", { class: "row" }, h("a", { class: "button", href: `#/verify/${encodeURIComponent(id)}` }, "Verify this person")),
   );
 }

@@ -1,27 +1,27 @@
 // A form that takes a person's id and photos, and beside it what comes of it.
 
-import { h } from "./dom.js";
+import { folded, h } from "./dom.js";
 import { holderKey } from "./holder.js";
 import { photoPicker } from "./photos.js";
 import { session } from "./service.js";
 import { offNote, subjectField, switchOf, whyOff } from "./subject.js";
 import { problemBox } from "./words.js";
 
-// What differs between the views: `action`, `title`, `lead`, `idHint` and `heading` (of `steps`, which are shown
-// until there is an outcome); `most` photos, and whether new ones replace them (`replaces`); `beside` the id; `level()`;
-// `movements`, and whether they are asked for (`moving()`); `verb()` on the button. `send(name, given, tools)` resolves
-// to an answer, or to null where the visitor gave up; `show(name, answer, tools)` makes the outcome of it, which is about
-// this person and these photos, and with `always` is shown whatever else was chosen meanwhile; `remedies(error, name, tools)`
-// go with a problem.
+// What differs between the views: `action`, `title` and `lead`; `most` photos, and whether new ones replace them and the
+// camera's are sent at once (`replaces`); `beside` the id; `level()`; `movements`, and whether they are asked for
+// (`moving()`); `verb` on the button; `progress(count, person)`, words below it; `empty`, shown until there is an outcome.
+// `send(name, given, tools)` resolves to an answer, or to null where the visitor gave up; `show(name, answer, tools)` makes
+// the outcome of it, which is about this person and these photos, and with `always` is shown whatever else was chosen
+// meanwhile; `remedies(error, name, tools)` go with a problem.
 export function photoForm(id, view) {
-  const { action } = view;
+  const { action, replaces = false } = view;
   const why = whyOff(action);
   const on = why === null;
-  const [subject, subjectPart] = subjectField(id, view.idHint);
+  const subject = subjectField(id, action, () => rest());
   const problem = h("div", {});
   const result = h("div", { class: "result", role: "status" });
-  const send = h("button", { type: "submit", disabled: true });
-  const steps = view.steps().map((step) => h("li", {}, step));
+  const progress = h("div", { class: "progress", role: "status" });
+  const send = h("button", { type: "submit", class: "primary", disabled: true });
   const say = (text) => (send.textContent = text);
   const moving = () => on && (view.moving?.() ?? false);
   // Counts what was asked: an answer to what is no longer on the page is not shown.
@@ -31,110 +31,124 @@ export function photoForm(id, view) {
     result.replaceChildren();
     problem.replaceChildren();
   };
-  const picker = on
-    ? photoPicker({
-        most: view.most,
-        replaces: view.replaces,
-        onchange: (ready) => {
-          send.disabled = !(ready || moving());
-          clear();
-        },
-      })
-    : null;
+  const changed = () => {
+    rest();
+    if (!shooting) clear();
+  };
+  let shooting = false;
+  const picker = on ? photoPicker({ most: view.most, replaces, shutter: !replaces, onchange: changed }) : null;
   const mode = on ? session.mode?.offer(action, refresh) : null;
-  const holder = holderKey(action, subject, clear);
+  const holder = holderKey(action, subject.input, clear);
+  // The camera whose photos are sent as soon as they are taken.
+  const shutter = () => (replaces && !moving() ? (picker?.live() ?? null) : null);
 
   // The level was changed, or private mode switched.
   function refresh() {
     clear();
     mode?.at(view.level?.(), picker);
-    view.steps().forEach((step, index) => (steps[index].textContent = step));
     if (view.movements) view.movements.root.hidden = !moving();
     if (picker) {
       picker.root.hidden = moving();
-      if (moving()) picker.pause();
+      if (moving()) picker.start();
     }
     rest();
   }
 
+  // What the button does next.
   function rest() {
-    say(view.verb());
-    send.disabled = !(moving() || picker?.ready());
+    const camera = shutter();
+    const starts = camera !== null && !camera.isOn();
+    say(starts ? "Start camera" : moving() ? "Start head movements" : view.verb);
+    send.disabled = !(camera || moving() || picker?.ready());
+    send.formNoValidate = starts;
+    progress.replaceChildren(...(view.progress?.(picker?.chosen().length ?? 0, subject.person()) ?? []));
   }
 
   async function submit(event) {
     event.preventDefault();
     if (fields.disabled) return;
     clear();
-    const asking = asked;
-    const name = subject.value;
-    const sent = picker.chosen();
-    const lifts = session.mode?.active() ? session.mode : null;
-    const tools = { lifts, say, drop: () => picker.drop(sent), problem, send };
-    let shown = { photos: picker.blobs(), face: picker.face() };
-    let answer = null;
-    let failure = null;
-    fields.disabled = true;
-    try {
-      const holder_key = await holder.key(name, say);
-      if (moving()) shown = await view.movements.frames(name);
-      answer = await view.send(name, { ...shown, holder_key }, tools);
-    } catch (error) {
-      failure = error;
+    const camera = shutter();
+    fields.disabled = shooting = true;
+    let goes = true;
+    if (camera?.isOn()) {
+      say("Hold still…");
+      const burst = await camera.burst();
+      goes = burst.length > 0 && root.isConnected;
+      if (goes) picker.take(burst);
+    } else if (camera) {
+      say("Starting…");
+      await camera.begin();
+      goes = false;
     }
+    shooting = false;
+    if (goes) await attempt();
     fields.disabled = false;
-    const left = () => (lifts && root.isConnected ? [lifts.whatLeft()] : []);
-    if (view.always || asking === asked) {
-      if (failure) {
-        if (failure.details && !moving()) picker.blame(failure, sent);
-        problem.replaceChildren(problemBox(failure), ...view.remedies(failure, name, tools), ...left());
-        problem.scrollIntoView({ block: "nearest" });
-      } else if (answer) {
-        const outcome = view.show(name, answer, tools);
-        // The field says who is enrolled by now.
-        if (action === "enroll") subject.dispatchEvent(new Event("input"));
-        result.replaceChildren(outcome, ...left());
-        if (outcome.tabIndex === -1 && outcome.hasAttribute("tabindex")) outcome.focus();
-        result.scrollIntoView({ block: "nearest" });
-      }
-    }
     rest();
     // A button that is switched off loses the focus.
     if (document.activeElement === document.body) send.focus();
   }
 
+  async function attempt() {
+    const asking = asked;
+    const name = subject.input.value;
+    const sent = picker.chosen();
+    const lifts = session.mode?.active() ? session.mode : null;
+    const tools = { lifts, say, drop: () => picker.drop(sent), problem, send };
+    let given = { photos: picker.blobs(), face: picker.face() };
+    let answer = null;
+    let failure = null;
+    try {
+      const holder_key = await holder.key(name, say);
+      if (moving()) given = await view.movements.frames(name);
+      answer = await view.send(name, { ...given, holder_key }, tools);
+    } catch (error) {
+      failure = error;
+    }
+    fields.disabled = false;
+    if (!view.always && asking !== asked) return;
+    const left = () => (lifts && root.isConnected ? [lifts.whatLeft()] : []);
+    if (failure) {
+      if (failure.details && !moving()) picker.blame(failure, sent);
+      problem.replaceChildren(problemBox(failure), ...view.remedies(failure, name, tools), ...left());
+      problem.scrollIntoView({ block: "nearest" });
+    } else if (answer) {
+      const outcome = view.show(name, answer, tools);
+      // The field says who is enrolled by now.
+      if (action === "enroll") subject.input.dispatchEvent(new Event("input"));
+      result.replaceChildren(outcome, ...left());
+      if (outcome.hasAttribute("tabindex")) outcome.focus();
+      result.scrollIntoView({ block: "nearest" });
+    }
+  }
+
   const fields = h(
     "fieldset",
     { class: "plain", disabled: !on },
-    view.beside ? h("div", { class: "pair" }, subjectPart, view.beside) : subjectPart,
-    switchOf(mode),
-    picker?.root,
-    on ? view.movements?.root : null,
-    holder.parts,
-    send,
+    h(
+      "div",
+      { class: "card who-part" },
+      subject.part,
+      view.beside,
+      on ? folded(action === "verify" ? "Options" : "Options: lock to a passkey, largest face", holder.parts, picker.option) : null,
+    ),
+    h("div", { class: "card photo-part" }, picker?.root, on ? view.movements?.root : null, switchOf(mode)),
+    h("div", { class: "act-part" }, progress, send),
   );
-  const form = h("form", { class: "card", onsubmit: submit }, fields);
+  const outcome = h("div", { class: "outcome" }, problem, result, h("div", { class: "empty" }, view.empty()));
+  const form = h("form", { class: "work", onsubmit: submit }, fields, outcome);
   const root = h(
     "section",
     {},
     h("h1", { tabindex: "-1" }, view.title),
     h("p", { class: "lead" }, view.lead),
     offNote(why),
-    h(
-      "div",
-      { class: "work" },
-      form,
-      h(
-        "div",
-        { class: "outcome" },
-        problem,
-        result,
-        h("section", { class: "card empty" }, h("h2", {}, view.heading), h("ol", {}, steps)),
-      ),
-    ),
+    form,
   );
-  if (view.replaces) subject.addEventListener("input", clear);
+  holder.fold(fields.querySelector("details"));
+  if (replaces) subject.input.addEventListener("input", clear);
   picker?.dropOn(form);
+  picker?.start();
   refresh();
   return {
     root,

@@ -1,12 +1,12 @@
 // Sign-in, navigation and focus; each view is a module of its own.
 
-import { carriesFiles, field, h, takesFiles } from "./dom.js";
+import { carriesFiles, command, field, h } from "./dom.js";
 import { enrollView } from "./enroll.js";
 import { peopleView } from "./people.js";
 import { serviceView } from "./status.js";
 import { forgetKey, hasKey, learn, session, useKey } from "./service.js";
 import { verifyView } from "./verify.js";
-import { problemBox } from "./words.js";
+import { DEMO, problemBox } from "./words.js";
 
 const VIEWS = {
   verify: ["Verify", verifyView],
@@ -14,6 +14,11 @@ const VIEWS = {
   people: ["People", peopleView],
   service: ["Service", serviceView],
 };
+const PROMISES = [
+  ["Only a set with decoys is kept.", "The face is one point of it among many. Photos and embeddings are forgotten; the set is encrypted."],
+  ["Every decision states its error.", "You choose how often a stranger may be accepted: 1 in 100, 1 in 1,000."],
+  ["Erasure leaves a proof.", "The template and its key are gone, and you hold a signed receipt."],
+];
 
 const main = document.getElementById("main");
 const nav = document.getElementById("nav");
@@ -21,7 +26,7 @@ const who = document.getElementById("who");
 let open = null;
 
 function show(view, title, focus = true) {
-  open?.stop();
+  open?.stop?.();
   open = view;
   main.replaceChildren(view.root);
   document.title = `${title} · Veilface`;
@@ -50,17 +55,12 @@ function route(focus = true) {
 }
 
 function signedIn(focus) {
-  nav.replaceChildren(
-    h(
-      "ul",
-      {},
-      Object.entries(VIEWS).map(([name, [title]]) =>
-        h("li", {}, h("a", { href: `#/${name}`, "data-view": name }, title)),
-      ),
-    ),
+  const links = Object.entries(VIEWS).map(([name, [title]]) =>
+    h("li", {}, h("a", { href: `#/${name}`, "data-view": name }, title)),
   );
+  nav.replaceChildren(h("ul", {}, links));
   who.replaceChildren(
-    h("span", { class: "fine" }, h("code", {}, `vf_${session.own.prefix}_…`)),
+    h("code", { class: "fine" }, `vf_${session.own.prefix}_…`),
     h("button", { type: "button", class: "quiet", onclick: () => signOut(null) }, "Sign out"),
   );
   nav.hidden = who.hidden = false;
@@ -75,13 +75,7 @@ function signOut(problem) {
 }
 
 function signInView(problem = null) {
-  const key = h("input", {
-    type: "password",
-    id: "key",
-    required: true,
-    autocomplete: "off",
-    spellcheck: "false",
-  });
+  const key = h("input", { type: "password", id: "key", required: true, autocomplete: "off", spellcheck: "false" });
   const keep = h("input", { type: "checkbox", id: "keep", checked: true, "aria-describedby": "keep-hint" });
   const send = h("button", { type: "submit" }, "Sign in");
   const trouble = h("div", {}, problem ? problemBox(problem) : null);
@@ -89,17 +83,10 @@ function signInView(problem = null) {
   async function submit(event) {
     event.preventDefault();
     const token = key.value.trim();
-    // A header carries visible ASCII only; anything else is no key.
-    if (!/^[!-~]+$/.test(token)) {
-      trouble.replaceChildren(
-        problemBox({ code: "unauthorized", message: "that is not an API key: keys begin with vf_", details: {} }),
-      );
-      return;
-    }
     send.disabled = true;
     trouble.replaceChildren();
-    useKey(token, keep.checked);
     try {
+      useKey(token, keep.checked);
       await learn();
       signedIn(true);
     } catch (error) {
@@ -110,30 +97,45 @@ function signInView(problem = null) {
     }
   }
 
+  const file = DEMO ? "demo-data/api-key" : "veilface-data-keys/api-key";
   const root = h(
     "section",
     { class: "sign-in" },
-    h("h1", { tabindex: "-1" }, "Sign in"),
-    h("p", { class: "lead" }, "Enroll people, verify them, and erase them."),
     h(
-      "form",
-      { class: "card", onsubmit: submit },
-      field("API key", key, [
-        "The service prints one when it first starts; ",
-        h("code", {}, "veilface keys create"),
-        " creates more.",
-      ]),
-      h("p", { class: "check" }, keep, h("label", { for: "keep" }, "Keep me signed in until I close this tab")),
+      "div",
+      { class: "claim" },
+      h("p", { class: "claim-line" }, "Face login that never stores a face."),
       h(
-        "p",
-        { class: "hint", id: "keep-hint" },
-        "A reload keeps it; a browser that restores the tab may bring it back. Sign out ends it.",
+        "dl",
+        { class: "promises" },
+        PROMISES.map(([what, how]) => h("div", {}, h("dt", {}, what), h("dd", {}, how))),
       ),
-      send,
     ),
-    trouble,
+    h(
+      "div",
+      {},
+      h(
+        "form",
+        { class: "card", onsubmit: submit },
+        h("h1", { tabindex: "-1" }, "Sign in"),
+        field("API key", key),
+        h("p", { class: "check" }, keep, h("label", { for: "keep" }, "Keep me signed in until I close this tab")),
+        send,
+        h("p", { class: "hint", id: "keep-hint" }, "A browser that restores the tab may bring the key back. Sign out ends it."),
+        trouble,
+      ),
+      h(
+        "section",
+        { class: "aside" },
+        h("h2", {}, "Where is my key?"),
+        h("p", {}, command(`veilface ${DEMO ? "demo" : "setup"}`), " wrote it to a file, which this prints:"),
+        h("pre", {}, command(`cat ${file}`)),
+        DEMO ? null : h("p", {}, "This makes another, with the rights that you name:"),
+        DEMO ? null : h("pre", {}, command("veilface keys create --right verify")),
+      ),
+    ),
   );
-  return { root, stop() {} };
+  return { root };
 }
 
 session.onrefused = (problem) => {
@@ -148,9 +150,7 @@ document.querySelector(".skip").addEventListener("click", (event) => {
 addEventListener("hashchange", () => route());
 // Files that miss a form that takes photos must not replace the page.
 for (const type of ["dragover", "drop"]) {
-  addEventListener(type, (event) => {
-    if (carriesFiles(event) && !takesFiles(event.target)) event.preventDefault();
-  });
+  addEventListener(type, (event) => carriesFiles(event) && event.preventDefault());
 }
 
 if (hasKey()) {

@@ -1,22 +1,37 @@
-import { command, confirmed, download, facts, field, h, when } from "./dom.js";
+import { command, confirmed, download, facts, field, h, plural, when } from "./dom.js";
 import { call, may, subjectPath } from "./service.js";
 import { about, enroller, offNote, people } from "./subject.js";
 import { lacking, problemBox } from "./words.js";
 
-const PAGE = 25;
+const PAGE = 100;
 const PAUSE_MS = 200;
+const byId = (one, other) => (one.subject_id < other.subject_id ? -1 : 1);
+const ORDERS = {
+  "by id": byId,
+  "latest first": (one, other) => other.updated_at.localeCompare(one.updated_at) || byId(one, other),
+  "fewest photos first": (one, other) => one.photos - other.photos || byId(one, other),
+};
 
 export function peopleView() {
   const list = h("ul", { class: "people" });
-  const said = h("p", { class: "hint", role: "status" }, "");
+  const status = h("p", { class: "hint", role: "status" });
   const problem = h("div", {});
   const receipts = h("div", { class: "result" });
   const prefix = h("input", { type: "search", autocomplete: "off", autocapitalize: "none", spellcheck: "false" });
-  const more = h("button", { type: "button", class: "secondary", hidden: true, onclick: load }, "Show more");
-  const title = h("h1", { tabindex: "-1" }, "People");
+  const order = h("select", { onchange: refill }, Object.keys(ORDERS).map((name) => h("option", {}, name)));
+  const more = h("button", { type: "button", class: "secondary", hidden: true, onclick: () => load() }, "Show more");
+  const unknown = h("div", {});
+  const none = h(
+    "section",
+    { class: "empty", hidden: true },
+    h("h2", {}, "Nobody is enrolled yet"),
+    h("p", {}, "Three photos, taken by one click, are enough. The person can then be verified, and erased, at once."),
+    h("a", { class: "button", href: "#/enroll" }, "Enroll the first person"),
+  );
   const why = may("enroll") ? null : lacking("enroll");
-  let cursor = null;
   const ended = new AbortController();
+  let shown = [];
+  let cursor = null;
   let asked = 0;
   let timer = 0;
 
@@ -35,13 +50,12 @@ export function peopleView() {
     try {
       const page = await people(prefix.value, { limit: PAGE, cursor });
       if (asking !== asked) return;
-      if (!cursor) list.replaceChildren();
-      const added = page.subjects.map(card);
-      list.append(...added);
-      if (cursor) added[0]?.querySelector("a, button")?.focus();
+      const added = page.subjects;
+      const next = cursor !== null;
+      shown = next ? [...shown, ...added] : added;
       cursor = page.next_cursor;
-      more.hidden = cursor === null;
-      count();
+      refill();
+      if (next) list.querySelector(`[data-id="${CSS.escape(added[0]?.subject_id ?? "")}"] a`)?.focus();
     } catch (error) {
       if (asking !== asked) return;
       problem.replaceChildren(problemBox(error));
@@ -49,110 +63,98 @@ export function peopleView() {
     more.disabled = false;
   }
 
-  function count() {
-    const shown = list.childElementCount;
-    said.textContent = shown
-      ? `${shown} ${shown === 1 ? "person" : "people"} shown${cursor ? ", with more to come" : ""}.`
-      : prefix.value
-        ? "Nobody’s id begins so."
-        : "Nobody is enrolled yet.";
-    none.hidden = shown > 0 || prefix.value !== "";
-    unknown.replaceChildren(...(!shown && prefix.value ? [enroller(prefix.value)] : []));
+  function refill() {
+    list.replaceChildren(...[...shown].sort(ORDERS[order.value]).map(entry));
+    more.hidden = cursor === null;
+    const absent = prefix.value && !shown.length;
+    status.textContent = absent
+      ? "Nobody’s id begins so."
+      : `${plural(shown.length, "person", "people")} shown${cursor ? ", with more to come" : ""}.`;
+    none.hidden = shown.length > 0 || prefix.value !== "";
+    status.hidden = !none.hidden;
+    unknown.replaceChildren(...(absent ? [enroller(prefix.value)] : []));
   }
 
-  function card(person) {
+  function entry(person) {
     const id = person.subject_id;
     const path = encodeURIComponent(id);
     const erasing = may("erase");
-    const erase = h(
-      "button",
-      {
-        type: "button",
-        class: "danger",
-        disabled: !erasing,
-        title: erasing ? null : lacking("erase"),
-        "aria-label": `Erase ${id}`,
-        onclick: () => eraseAsked(id, item),
-      },
-      "Erase…",
-    );
-    const item = h(
+    const off = erasing ? null : lacking("erase");
+    const ask = (event) => eraseAsked(id, event.target);
+    return h(
       "li",
-      { class: "person" },
+      { class: "person", "data-id": id },
       h("div", {}, h("h2", {}, id), h("p", { class: "hint" }, about(person))),
+      h("a", { href: `#/verify/${path}`, "aria-label": `Verify ${id}` }, "Verify"),
+      h("a", { href: `#/enroll/${path}`, "aria-label": `Enroll ${id} again` }, "Enroll again"),
       h(
-        "p",
-        { class: "row" },
-        h("a", { href: `#/verify/${path}`, "aria-label": `Verify ${id}` }, "Verify"),
-        h("a", { href: `#/enroll/${path}`, "aria-label": `Enroll ${id} again` }, "Enroll again"),
-        erase,
+        "button",
+        { type: "button", class: "quiet erase", disabled: !erasing, title: off, "aria-label": `Erase ${id}`, onclick: ask },
+        "Erase",
       ),
     );
-    return item;
   }
 
-  async function eraseAsked(id, item) {
+  async function eraseAsked(id, button) {
     const agreed = await confirmed(
       `Erase ${id}?`,
-      "This removes the template, its key and everything else that is kept about this person. It cannot " +
-        "be undone. You get a signed receipt.",
+      "This removes the template, its key and everything else that is kept about this person. It cannot be undone. " +
+        "You get a signed receipt.",
       "Erase",
       ended.signal,
     );
     if (!agreed) return;
     problem.replaceChildren();
-    item.querySelector("button").disabled = true;
+    button.disabled = true;
     try {
       const answer = await call("DELETE", subjectPath(id));
-      item.remove();
-      count();
-      const shown = receipt(id, answer);
+      shown = shown.filter((person) => person.subject_id !== id);
+      refill();
+      const latest = receipt(id, answer);
       // Those of earlier erasures stay: they may not have been downloaded yet.
-      receipts.prepend(shown);
-      shown.focus();
+      receipts.prepend(latest);
+      latest.focus();
     } catch (error) {
-      item.querySelector("button").disabled = false;
+      button.disabled = false;
       problem.replaceChildren(problemBox(error));
       problem.scrollIntoView({ block: "nearest" });
     }
   }
 
-  const none = h(
-    "section",
-    { class: "card empty", hidden: true },
-    h("h2", {}, "Enroll the first person"),
-    h("p", {}, "Three photos by one click are enough. Whoever is enrolled can be verified, and erased, at once."),
-    h("p", {}, h("a", { class: "button", href: "#/enroll" }, "Enroll")),
-  );
-  const unknown = h("div", {});
   prefix.addEventListener("input", search);
   if (!why) load();
-  const stop = () => {
-    clearTimeout(timer);
-    ended.abort();
-  };
   const root = h(
     "section",
     {},
-    title,
-    h("p", { class: "lead" }, "Everyone who is enrolled, by id."),
+    h(
+      "div",
+      { class: "heading" },
+      h("h1", { tabindex: "-1" }, "People"),
+      why ? null : h("a", { class: "button", href: "#/enroll" }, "Enroll"),
+    ),
     offNote(why),
     may("erase") ? null : offNote(lacking("erase")),
     receipts,
     problem,
-    why ? null : h("div", { class: "find" }, field("Find people whose id begins with", prefix)),
-    said,
+    why ? null : h("div", { class: "find" }, field("Find by how the id begins", prefix), field("Order", order)),
+    status,
     none,
     unknown,
     list,
     more,
   );
-  return { root, stop };
+  return {
+    root,
+    stop() {
+      clearTimeout(timer);
+      ended.abort();
+    },
+  };
 }
 
 function receipt(id, answer) {
   const { claims } = answer;
-  const text = JSON.stringify(answer, null, 1);
+  const save = () => download(`receipt-${claims.receipt_id}.json`, JSON.stringify(answer, null, 1));
   return h(
     "div",
     { class: "verdict accept", role: "status", tabindex: "-1" },
@@ -163,19 +165,7 @@ function receipt(id, answer) {
       ["Pseudonym on the receipt", h("code", {}, `${claims.subject.slice(0, 16)}…`)],
       ["Signing key", h("code", {}, claims.signing_key)],
     ]),
-    h(
-      "p",
-      { class: "row" },
-      h(
-        "button",
-        {
-          type: "button",
-          class: "secondary",
-          onclick: () => download(`receipt-${claims.receipt_id}.json`, text),
-        },
-        "Download receipt",
-      ),
-    ),
+    h("p", { class: "row" }, h("button", { type: "button", class: "secondary", onclick: save }, "Download receipt")),
     h(
       "p",
       { class: "fine" },

@@ -1,16 +1,14 @@
 // Where photos come from (camera, files, in the demo cartoon people), and a tray of those chosen.
 
-import { camera, check, picture, unasked } from "./camera.js";
-import { carriesFiles, faceBox, h, newId, takesFiles } from "./dom.js";
-import { Problem, call } from "./service.js";
+import { BURST, camera, check, picture, unasked } from "./camera.js";
+import { carriesFiles, choice, faceBox, h, newId } from "./dom.js";
+import { BASE, Problem, call } from "./service.js";
 import { DEMO, guidance, problemBox, sentence } from "./words.js";
 
 // What is larger is made smaller once, when it is chosen; the same bytes are then checked and sent.
 // Ten of the largest stay below what a request may have.
 const SIDE = 1600;
 const BYTES = 2 * 1024 * 1024;
-
-const SOURCES = { camera: "Camera", files: "Files", drawn: "Cartoon people" };
 
 // Runs one piece of work after the other.
 function inTurn() {
@@ -32,14 +30,16 @@ async function smaller(blob) {
   }
 }
 
-// `replaces`: what is chosen takes the place of what was chosen before.
-export function photoPicker({ most, replaces = false, onchange }) {
+// `most` photos; with `replaces`, what is chosen takes the place of what was chosen before. With `shutter` the camera has
+// a button of its own; else `live()` is the camera, where that is the source.
+export function photoPicker({ most, replaces = false, shutter = false, onchange }) {
   const photos = [];
   const tray = h("ul", { class: "tray", "aria-label": "Chosen photos" });
-  const told = h("p", { class: "hint", role: "status" });
+  const status = h("p", { class: "hint", role: "status" });
   const panel = h("div", { class: "source" });
-  const largest = h("input", { type: "checkbox", id: newId("largest") });
+  const largest = h("input", { type: "checkbox", id: newId("largest"), onchange: () => photos.forEach(look) });
   const face = () => (largest.checked ? "largest" : "");
+  const ended = new AbortController();
   let live = null;
   // Decoded, photos of a telephone take 50 MB each.
   const decoding = inTurn();
@@ -53,9 +53,7 @@ export function photoPicker({ most, replaces = false, onchange }) {
     const room = most - photos.length;
     together.slice(0, room).forEach(add);
     if (together.length > room) {
-      told.textContent = replaces
-        ? `No more than ${most} photos: these are the first.`
-        : `No more than ${most} photos: remove one first.`;
+      status.textContent = `No more than ${most} photos: ${replaces ? "these are the first" : "remove one first"}.`;
     }
   }
 
@@ -64,45 +62,40 @@ export function photoPicker({ most, replaces = false, onchange }) {
     const pictures = [...files].filter((file) => file.type.startsWith("image/"));
     const others = [...files].filter((file) => !pictures.includes(file));
     if (pictures.length) take(pictures.map((file) => ({ blob: file, name: file.name, seen: null })));
-    if (others.length) told.textContent = `No picture: ${others.map((file) => file.name).join(", ")}.`;
+    if (others.length) status.textContent = `No picture: ${others.map((file) => file.name).join(", ")}.`;
   }
 
   // `seen` is what the service saw already in this very photo, or null.
   function add({ blob, name, seen }) {
-    const photo = { blob: null, name, ...faceBox(), image: h("img", { alt: `Chosen photo, from ${name}` }) };
+    // What the camera took has its size already.
+    const ready = name === "camera" ? blob : null;
+    const photo = { blob: ready, name, ...faceBox(), image: h("img", { alt: `Chosen photo, from ${name}` }) };
     photo.thumb = h("span", { class: "thumb" }, photo.image, photo.overlay);
     photo.number = h("span", { class: "number" });
-    photo.said = h("span", { class: "seen", "data-state": "idle" }, "Checking…");
+    photo.verdict = h("span", { class: "seen", "data-state": "idle" }, "Checking…");
+    const drop = () => {
+      remove(photo);
+      (tray.querySelector("button") ?? panel.querySelector("button, input, select"))?.focus();
+    };
+    const label = `Remove photo from ${name}`;
     photo.item = h(
       "li",
       {},
       photo.thumb,
       photo.number,
-      photo.said,
-      h(
-        "button",
-        {
-          type: "button",
-          class: "quiet",
-          "aria-label": `Remove photo from ${name}`,
-          onclick: () => {
-            remove(photo);
-            (tray.querySelector("button") ?? panel.querySelector("button, input, select"))?.focus();
-          },
-        },
-        "Remove",
-      ),
+      photo.verdict,
+      h("button", { type: "button", class: "remove", "aria-label": label, title: "Remove", onclick: drop }, "✕"),
     );
     photos.push(photo);
     tray.append(photo.item);
     changed();
     decoding(async () => {
       if (!photos.includes(photo)) return;
-      photo.blob = seen ? blob : await smaller(blob);
+      photo.blob ??= await smaller(blob);
       if (!photos.includes(photo)) return;
       // What is sent is what is shown: its faces are found in these pixels.
       photo.image.src = URL.createObjectURL(photo.blob);
-      onchange(ready());
+      if (!ready) onchange();
       if (seen) tell(photo, seen);
       else look(photo);
     });
@@ -120,11 +113,9 @@ export function photoPicker({ most, replaces = false, onchange }) {
   function changed() {
     // The numbers that the service's messages use.
     photos.forEach((photo, index) => (photo.number.textContent = `Photo ${index + 1}`));
-    told.textContent = `${photos.length} of ${most} photos chosen.`;
-    onchange(ready());
+    status.textContent = photos.length ? `${photos.length} of ${most} photos chosen.` : "";
+    onchange();
   }
-
-  const ready = () => photos.length > 0 && photos.every((each) => each.blob);
 
   function look(photo) {
     asking(async () => {
@@ -140,27 +131,42 @@ export function photoPicker({ most, replaces = false, onchange }) {
     });
   }
 
-  const ended = new AbortController();
-
   async function tell(photo, seen) {
-    say(photo, guidance(seen), seen.usable ? "good" : "bad");
+    say(photo, seen.usable ? "Good" : guidance(seen), seen.usable ? "good" : "bad");
     await photo.image.decode().catch(() => {});
     photo.mark(seen.box, photo.image.naturalWidth, photo.image.naturalHeight);
   }
 
   function say(photo, text, state) {
-    photo.said.textContent = text;
-    photo.said.dataset.state = state;
+    photo.verdict.textContent = text;
+    photo.verdict.dataset.state = state;
   }
 
-  const builders = {
+  const sources = {
     camera() {
-      live = camera({ onburst: take, face });
-      return live.root;
+      const verb = () => (live?.isOn() ? `Take ${BURST} photos` : "Start camera");
+      const button = h("button", { type: "button", class: "secondary", onclick: press }, verb());
+      live = camera({
+        face,
+        onchange: () => {
+          button.textContent = verb();
+          onchange();
+        },
+      });
+      async function press() {
+        button.disabled = true;
+        if (live.isOn()) take(await live.burst());
+        else await live.begin();
+        button.disabled = false;
+        // A button that is switched off loses the focus.
+        if (document.activeElement === document.body) button.focus();
+      }
+      return [live.root, shutter ? h("p", { class: "row" }, button) : ""];
     },
     files() {
       const input = h("input", {
         type: "file",
+        class: "unseen",
         id: newId("files"),
         accept: "image/jpeg,image/png,image/webp",
         multiple: true,
@@ -169,129 +175,96 @@ export function photoPicker({ most, replaces = false, onchange }) {
           input.value = "";
         },
       });
-      const many = `Photos: JPEG, PNG or WebP, up to ${most}`;
-      const drag = h("p", { class: "hint" }, "Or drop them anywhere in this form.");
-      return h("div", { class: "drop" }, h("label", { for: input.id }, many), input, drag);
+      const hint = h("span", { class: "hint" }, `JPEG, PNG or WebP, up to ${most}`);
+      return [input, h("label", { class: "drop", for: input.id }, h("strong", {}, "Choose photos, or drop them here"), hint)];
     },
     drawn() {
-      const who = h("select", { id: newId("who") });
+      const who = h("select", { id: newId("who"), onchange: show });
       const shots = h("div", { class: "shots" });
-      const show = () => {
-        const urls = Array.from({ length: shown }, (_, index) => `/demo/people/${who.value}/${index}.png`);
+      let count = 0;
+      function show() {
         shots.replaceChildren(
-          ...urls.map((url, index) =>
-            h(
+          ...Array.from({ length: count }, (_, index) => {
+            const url = `${BASE}/demo/people/${who.value}/${index}.png`;
+            const name = `${who.value}, photo ${index + 1}`;
+            const choose = async () => {
+              const drawn = await fetch(url);
+              if (drawn.ok) take([{ blob: await drawn.blob(), name, seen: null }]);
+            };
+            const label = `Choose photo ${index + 1} of ${who.value}`;
+            return h(
               "button",
-              {
-                type: "button",
-                class: "shot",
-                "aria-label": `Choose photo ${index + 1} of ${who.value}`,
-                onclick: async () => {
-                  const drawn = await fetch(url);
-                  if (!drawn.ok) return;
-                  const name = `${who.value}, photo ${index + 1}`;
-                  take([{ blob: await drawn.blob(), name, seen: null }]);
-                },
-              },
+              { type: "button", class: "shot", "aria-label": label, onclick: choose },
               h("img", { src: url, alt: "", width: "84", height: "84" }),
-            ),
-          ),
+            );
+          }),
         );
-      };
-      let shown = 0;
-      who.addEventListener("change", show);
+      }
       const place = h("div", {});
       call("GET", "/demo/people")
-        .then((told) => {
-          shown = told.shots;
-          who.append(...told.people.map((each) => h("option", {}, each)));
+        .then(({ people, shots: each }) => {
+          count = each;
+          who.append(...people.map((person) => h("option", {}, person)));
           show();
         })
         .catch((error) => place.replaceChildren(problemBox(error)));
-      return h(
-        "div",
-        {},
-        h("div", { class: "field" }, h("label", { for: who.id }, "Cartoon person"), who),
-        shots,
-        place,
-      );
+      return [h("div", { class: "field" }, h("label", { for: who.id }, "Cartoon person"), who), shots, place];
     },
   };
 
   function choose(source) {
     live?.stop();
     live = null;
-    panel.replaceChildren(builders[source]());
+    panel.replaceChildren(...sources[source]());
+    onchange();
   }
 
-  const name = newId("source");
-  const sources = Object.keys(SOURCES).filter((each) => DEMO || each !== "drawn");
-  const first = DEMO ? "drawn" : "camera";
-  const sourceChoice = h(
-    "fieldset",
-    { class: "choice" },
-    h("legend", {}, `1 to ${most} photos of one person`),
-    sources.map((each) => {
-      const radio = h("input", {
-        type: "radio",
-        name,
-        id: newId("source"),
-        value: each,
-        checked: each === first,
-        onchange: () => choose(each),
-      });
-      return h("span", {}, radio, h("label", { for: radio.id }, SOURCES[each]));
-    }),
-  );
-  choose(first);
-  largest.addEventListener("change", () => photos.forEach(look));
+  const names = { ...(DEMO ? { drawn: "Cartoon people" } : {}), camera: "Camera", files: "Files" };
+  const source = choice("Photos from", names, { value: Object.keys(names)[0], onchange: choose });
   const root = h(
     "div",
     { class: "picker" },
-    sourceChoice,
-    DEMO
-      ? h("p", { class: "hint" }, "The demo model sees only cartoon faces, not real ones.")
-      : null,
+    source.root,
+    DEMO ? h("p", { class: "hint" }, "The demo model sees only cartoon faces, not real ones.") : null,
     panel,
     tray,
-    told,
-    h(
-      "p",
-      { class: "check" },
-      largest,
-      h("label", { for: largest.id }, "Others are in the picture: use the largest face, wherever it is"),
-    ),
+    status,
   );
-  const holds = (event) =>
-    !root.hidden && !root.closest(":disabled") && carriesFiles(event) && !takesFiles(event.target);
+  const option = h(
+    "p",
+    { class: "check" },
+    largest,
+    h("label", { for: largest.id }, "Others are in the picture: use the largest face, wherever it is"),
+  );
+  const holds = (event) => !root.hidden && !root.closest(":disabled") && carriesFiles(event);
   return {
     root,
+    option,
     face,
-    ready,
+    take,
+    live: () => live,
+    start: () => choose(source.value()),
+    ready: () => photos.length > 0 && photos.every((photo) => photo.blob),
     // Let photos be dropped on a form.
     dropOn(form) {
       const over = (event) => form.classList.toggle("dropping", event.type === "dragover" && holds(event));
       for (const type of ["dragover", "dragleave", "drop"]) form.addEventListener(type, over);
       form.addEventListener("drop", (event) => holds(event) && takeFiles(event.dataTransfer.files));
     },
-    blobs: () => photos.map((each) => each.blob),
+    blobs: () => photos.map((photo) => photo.blob),
     chosen: () => [...photos],
     // What the service said of single photos, by their places among those `sent`.
     blame(problem, sent) {
       const { image, photos: unlike } = problem.details;
-      if (Number.isInteger(image) && sent[image]) {
-        say(sent[image], sentence(problem.message.replace(/^photo \d+ of \d+: /, "")), "bad");
-      }
+      if (sent[image]) say(sent[image], sentence(problem.message.replace(/^photo \d+ of \d+: /, "")), "bad");
       for (const index of unlike ?? []) {
         if (sent[index]) say(sent[index], "Does not look like the person in the other photos.", "bad");
       }
     },
-    // Let go of the camera, which somebody else is to use.
-    pause: () => choose(sourceChoice.querySelector(":checked").value),
     // Empty the tray of what was sent, of which the pictures are handed out.
     drop(sent) {
-      sent.filter((each) => photos.includes(each)).forEach(remove);
-      return sent.map((each) => each.thumb);
+      sent.filter((photo) => photos.includes(photo)).forEach(remove);
+      return sent.map((photo) => photo.thumb);
     },
     stop: () => {
       live?.stop();

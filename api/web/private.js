@@ -1,11 +1,10 @@
 // Private mode: this page finds, aligns and embeds the face, and sends a lifted template alone. It is
 // fetched only where the service serves its pack.
 
-import { bytes, h, newId, table } from "./dom.js";
-import { Problem, call, may, session, untilSignedOut } from "./service.js";
+import { folded, h, newId, table } from "./dom.js";
+import { BASE, Problem, call, may, session, untilSignedOut } from "./service.js";
 import { lacking } from "./words.js";
 
-const RUNTIME = "/assets/client/ort.wasm.min.mjs";
 // The graphs are fetched before anybody is named: their token is of a subject that nobody is.
 const NOBODY = "private-mode";
 const TRIES = 3;
@@ -36,6 +35,7 @@ let left = new Map();
 // At sign-out: the next one to sign in begins anew.
 export function forget() {
   on = true;
+  document.documentElement.dataset.lifting = "no";
   prepared = null;
   [lifts, purposes, left] = [new Map(), new Map(), new Map()];
 }
@@ -86,12 +86,13 @@ export function offer(action, onchange) {
     dropped = "";
     if (before && !active() && picker) {
       // Nothing that was taken under the promise is sent without it.
-      picker.pause();
+      picker.start();
       if (picker.drop(picker.chosen()).length) dropped = DROPPED;
     }
     box.checked = active();
     box.disabled = offered.why !== null;
     told.className = offered.why ? "off" : "hint";
+    document.documentElement.dataset.lifting = active() ? "yes" : "no";
     say();
   }
 
@@ -133,7 +134,7 @@ function ready() {
 }
 
 async function load(signal, action) {
-  const runtime = await import(RUNTIME).catch(() => {
+  const runtime = await import("./client/ort.wasm.min.mjs").catch(() => {
     throw new Problem({ code: "private_mode", message: "what private mode runs could not be loaded" });
   });
   // More need a page that is isolated.
@@ -145,7 +146,7 @@ async function load(signal, action) {
   for (let tries = 1; ; tries++) {
     signal.throwIfAborted();
     const bearer = await token({ subject_id: NOBODY, action }, signal);
-    const client = new session.client.PrivateClient(location.origin, bearer, { runtime, fetch: noted, signal });
+    const client = new session.client.PrivateClient(BASE, bearer, { runtime, fetch: noted, signal });
     try {
       await client.prepare();
       signal.addEventListener("abort", () => void client.close());
@@ -271,8 +272,9 @@ export const enroll = (name, { photos, face, holder_key }, replaces) =>
 
 // Count every call of the page, in private mode or not.
 export function note(method, target, body) {
-  const { pathname, searchParams } = new URL(target, location);
-  const request = `${method} ${pathname.replace(/([0-9a-f]{8})[0-9a-f]{56}/, "$1…")}`;
+  const { searchParams, href } = new URL(target);
+  const path = href.slice(BASE.length).replace(/\?.*/, "");
+  const request = `${method} ${path.replace(/([0-9a-f]{8})[0-9a-f]{56}/, "$1…")}`;
   const sent = typeof body === "string" ? Object.entries(JSON.parse(body)) : [...(body ?? [])];
   const fields = [...searchParams, ...sent];
   for (const [field, value] of fields.length ? fields : [["no body", ""]]) {
@@ -301,21 +303,24 @@ export function whatLeft() {
     "section",
     { class: "card", "data-left": "" },
     h("h2", {}, "What left this browser"),
-    h(
-      "p",
-      {},
-      photos,
-      "These are the calls since you signed in, or since this was last shown. ",
-      "Beside these fields, they had their headers, with the API key or a token.",
-    ),
-    table(
-      "Fields that were sent",
-      ["Request", "Field", "Size"],
-      rows.map(({ request, field, times, size, photo }) => [
-        h("code", {}, request),
-        [field, photo ? ", a photo" : "", times > 1 ? `, ${times} times` : ""].join(""),
-        bytes(size),
-      ]),
+    h("p", {}, photos),
+    folded(
+      "Every field that was sent",
+      h(
+        "p",
+        { class: "hint" },
+        "These are the calls since you signed in, or since this was last shown. ",
+        "Beside these fields, they had their headers, with the API key or a token.",
+      ),
+      table(
+        "Fields that were sent",
+        ["Request", "Field", "Size"],
+        rows.map(({ request, field, times, size, photo }) => [
+          h("code", {}, request),
+          [field, photo ? ", a photo" : "", times > 1 ? `, ${times} times` : ""].join(""),
+          `${size.toLocaleString("en")} bytes`,
+        ]),
+      ),
     ),
   );
 }

@@ -2,7 +2,8 @@
 // unticks it in this tab's session storage, which a browser may restore with the tab from its disk.
 
 const KEPT = "veilface-key";
-const CLIENT = "/assets/client/client.js";
+// Where the service is, which may be below a prefix of a proxy's: paths of calls are put behind it.
+export const BASE = new URL("..", import.meta.url).href.slice(0, -1);
 let key = kept((storage) => storage.getItem(KEPT)) ?? null;
 // Ends what still runs for a key that is forgotten.
 let running = new AbortController();
@@ -16,6 +17,10 @@ export const session = { own: null, contract: null, client: null, mode: null, on
 export const hasKey = () => key !== null;
 
 export function useKey(token, keep) {
+  // A header carries visible ASCII only; anything else is no key.
+  if (!/^[!-~]+$/.test(token)) {
+    throw new Problem({ code: "unauthorized", message: "that is not an API key: keys begin with vf_" });
+  }
   key = token;
   kept((storage) => (keep ? storage.setItem(KEPT, token) : storage.removeItem(KEPT)));
 }
@@ -54,9 +59,9 @@ export async function call(method, path, { body, headers, signal } = {}) {
   const used = key;
   const ended = AbortSignal.any([running.signal, ...(signal ? [signal] : [])]);
   let answer;
-  session.mode?.note(method, path, body);
+  session.mode?.note(method, BASE + path, body);
   try {
-    answer = await fetch(path, {
+    answer = await fetch(BASE + path, {
       method,
       body,
       signal: ended,
@@ -69,15 +74,15 @@ export async function call(method, path, { body, headers, signal } = {}) {
     throw new Problem({ code: "unreachable", message: "the service does not respond" });
   }
   if (answer.headers.get("X-Veilface-Notice")) dataset.demo = "yes";
-  const told = await answer.json().catch(() => null);
+  const content = await answer.json().catch(() => null);
   ended.throwIfAborted();
-  if (answer.ok && told) return told;
+  if (answer.ok && content) return content;
   const problem = new Problem({
     status: answer.status,
-    code: told?.error?.code ?? "unreachable",
-    message: told?.error?.message ?? `status ${answer.status}, and not from this service`,
-    details: told?.error?.details ?? {},
-    requestId: told?.request_id ?? answer.headers.get("X-Request-ID"),
+    code: content?.error?.code ?? "unreachable",
+    message: content?.error?.message ?? `status ${answer.status}, and not from this service`,
+    details: content?.error?.details ?? {},
+    requestId: content?.request_id ?? answer.headers.get("X-Request-ID"),
     wait: Number(answer.headers.get("Retry-After")) || null,
   });
   // `replayed` is about a challenge; else the key itself was refused, if it is still in use.
@@ -95,12 +100,9 @@ export function form(name, photos, fields = {}) {
 }
 
 export async function learn() {
-  if (dataset.client === "yes") session.client ??= await import(CLIENT).catch(() => null);
+  if (dataset.client === "yes") session.client ??= await import("./client/client.js").catch(() => null);
   if (LIFTS) session.mode ??= await import("./private.js").catch(() => null);
-  [session.own, session.contract] = await Promise.all([
-    call("GET", "/v1/key"),
-    call("GET", "/v1/contract"),
-  ]);
+  [session.own, session.contract] = await Promise.all([call("GET", "/v1/key"), call("GET", "/v1/contract")]);
 }
 
 // Levels that a photo can be verified at with this key.

@@ -1,5 +1,6 @@
-import { download, facts, h, oneIn, percent, table, when } from "./dom.js";
-import { call, session } from "./service.js";
+import { download, facts, field, folded, h, oneIn, percent, table, when } from "./dom.js";
+import { call, may, session, subjectPath } from "./service.js";
+import { people } from "./subject.js";
 import { problemBox } from "./words.js";
 
 const RIGHTS = {
@@ -9,168 +10,183 @@ const RIGHTS = {
   export: "export and import templates",
   scores: "see distances",
   embeddings: "send embeddings and templates",
+  metrics: "read the metrics",
   admin: "lift lockouts and read the audit log",
 };
 
 export function serviceView() {
-  const { contract, own } = session;
-  const health = h("div", { role: "status" }, h("p", { class: "hint" }, "Checking…"));
-  ask(health);
+  const { contract } = session;
+  const save = () => download("contract.json", JSON.stringify(contract, null, 1));
   const root = h(
     "section",
     {},
-    h("h1", { tabindex: "-1" }, "Service"),
+    h("div", { class: "heading" }, h("h1", { tabindex: "-1" }, "Service"), health()),
+    privacyCard(contract),
+    h("div", { class: "columns" }, storedCard(contract), keyCard(session.own)),
     h(
       "section",
       { class: "card" },
-      h("h2", {}, "Verdict"),
-      h(
-        "p",
-        {},
-        "From the database alone a thief gets encrypted bytes, which open only with the master key. ",
-        contract.verdict
-          ? "What the strongest attack opened with the master key as well, and how accurate the service is:"
-          : h("strong", {}, "Nobody has measured what opens with the master key as well: veilface calibrate does."),
-      ),
       h(
         "div",
-        { class: "columns three" },
-        judged("Privacy: templates that a thief can open", contract.verdict?.privacy),
-        judged("Accuracy: people turned away wrongly", contract.verdict?.accuracy),
-        judged("Groups: strangers let in, in the worst group of people", contract.verdict?.groups),
+        { class: "heading" },
+        h("h2", {}, "Levels"),
+        h("button", { type: "button", class: "secondary", onclick: save }, "Download contract"),
       ),
+      h("p", { class: "hint" }, "How often each level accepts a stranger, and rejects the right person, as counted when it was calibrated."),
+      contract.calibrations.map(levelTable),
+    ),
+  );
+  return { root };
+}
+
+function health() {
+  const strip = h("div", { class: "health", role: "status" });
+  const again = h("button", { type: "button", class: "quiet", onclick: ask }, "Check again");
+  async function ask() {
+    strip.replaceChildren(h("span", {}, "Checking…"));
+    const ready = await call("GET", "/health/ready").then(
+      () => h("span", { class: "up" }, "Database and model are up"),
+      problemBox,
+    );
+    strip.replaceChildren(ready, again);
+  }
+  ask();
+  return strip;
+}
+
+// What a thief gets, in one line that says no more than was shown.
+function privacyCard({ verdict }) {
+  const { privacy, accuracy, groups } = verdict ?? {};
+  const proven = privacy?.status === "PASS";
+  const opens = !privacy?.rate.errors
+    ? `none of ${privacy?.rate.trials.toLocaleString("en")} people could be recognised elsewhere`
+    : privacy.value > 0.7
+      ? "nearly everybody could be recognised elsewhere"
+      : `about 1 person in ${Math.round(1 / privacy.value)} could be recognised elsewhere`;
+  return h(
+    "section",
+    { class: `card privacy ${proven ? "proven" : "unproven"}` },
+    h("h2", { class: "verdict-word" }, privacy ? (proven ? "✓ Privacy: shown" : "Privacy: not proven") : "Privacy: not measured"),
+    h(
+      "p",
+      {},
+      "A stolen database alone is encrypted, and opens only with the master key. ",
+      privacy
+        ? `If both are stolen, ${opens}.`
+        : "Nobody has measured what opens if both are stolen: veilface calibrate does.",
+      privacy?.shortfall ? ` This is not enough to prove it: ${privacy.shortfall}.` : "",
     ),
     h(
       "div",
-      { class: "columns" },
-      h(
-        "section",
-        { class: "card" },
-        h("h2", {}, "Health"),
-        health,
-        h(
-          "p",
-          {},
-          h("button", { type: "button", class: "secondary", onclick: () => ask(health) }, "Check again"),
-        ),
-      ),
-      h(
-        "section",
-        { class: "card" },
-        h("h2", {}, "This key"),
-        facts([
-          ["Key", h("code", {}, `vf_${own.prefix}_…`)],
-          ["Tenant", own.tenant],
-          ["Expires", own.expires_at ? when(own.expires_at) : "never"],
-        ]),
-        h(
-          "ul",
-          { class: "rights", "aria-label": "Rights" },
-          Object.entries(RIGHTS).map(([right, meaning]) => {
-            const has = own.rights.includes(right);
-            return h(
-              "li",
-              { class: has ? "has" : "lacks" },
-              h("span", { "aria-hidden": "true" }, has ? "✓ " : "– "),
-              h("strong", {}, right),
-              `: ${has ? "may" : "may not"} ${meaning}`,
-            );
-          }),
-        ),
-      ),
-    ),
-    h(
-      "section",
-      { class: "card" },
-      h("h2", {}, "Contract"),
-      h("p", { class: "hint" }, "What every template and threshold belongs to."),
-      facts([
-        ["Contract", h("code", {}, contract.contract_id)],
-        ["Model pack", String(contract.recorded.pack ?? "not recorded")],
-        ["Accepts photos", contract.photos ? "yes" : "no: there is no model pack"],
-        ["Lifting", `${contract.binding.strategy}, m = ${contract.binding.m} of ${contract.binding.axes} axes, n = ${contract.binding.n}`],
-        ["Decoys", h("code", {}, contract.binding.decoy_source_id)],
-        ["Default level", contract.default_level],
-        ["Receipt key", h("code", {}, contract.receipt_key.public_key)],
-      ]),
-      h(
-        "p",
-        {},
-        h(
-          "button",
-          {
-            type: "button",
-            class: "secondary",
-            onclick: () => download("contract.json", JSON.stringify(contract, null, 1)),
-          },
-          "Download contract",
-        ),
-      ),
-      contract.calibrations.map((each) =>
-        table(
-          each.mode === "p2s"
-            ? each.probe_photos === 1
-              ? "Levels for one photo"
-              : `Levels for ${each.probe_photos} photos of a probe`
-            : `Levels for lifted probes, m = ${each.probe_m}`,
-          ["Level", "Strangers accepted: target", "Measured (FMR)", "Right people rejected (FNMR)"],
-          each.levels.map((level) => [
-            level.name,
-            level.target_fmr ? `${percent(level.target_fmr)} (${oneIn(level.target_fmr)})` : "none",
-            counted(level.fmr),
-            counted(level.fnmr),
-          ]),
-        ),
-      ),
+      { class: "tiles" },
+      tile("Recognised by a thief", privacy),
+      tile("Right people rejected", accuracy),
+      tile("Strangers accepted, in the worst group", groups),
     ),
   );
-  return { root, stop() {} };
 }
 
 // One judgement of the verdict: its figure, what was counted, and the limit.
-function judged(title, judgement) {
-  if (!judgement) return h("div", {}, h("h3", {}, title), h("p", {}, "Not measured."));
-  const { rate, value, limit, status, basis, shortfall } = judgement;
-  const group = basis.group ? `in ${basis.attribute} ${basis.group}, ` : "";
+function tile(title, judgement) {
+  if (!judgement) return h("div", {}, h("h3", {}, title), h("p", { class: "number" }, "–"), h("p", { class: "hint" }, "not measured"));
+  const { rate, value, limit, status, basis } = judgement;
   const passes = status === "PASS";
+  const mark = passes ? "✓ within" : status === "FAIL" ? "✕ above" : "not shown to be within";
+  const group = basis.group ? `${basis.attribute} ${basis.group}, ` : "";
   return h(
     "div",
     {},
     h("h3", {}, title),
-    h(
-      "p",
-      { class: "figure" },
-      h("span", { class: "figure-number" }, percent(value)),
-      h("strong", { class: passes ? "ok" : "bad" }, passes ? "✓ PASS" : "✗ FAIL"),
+    h("p", { class: "number" }, percent(value)),
+    h("p", { class: passes ? "ok" : "doubt" }, `${mark} the limit of ${percent(limit)}`),
+    h("p", { class: "hint" }, `${group}${rate.errors} of ${rate.trials.toLocaleString("en")}`),
+  );
+}
+
+// What the service keeps of a person, by the example of one who is enrolled.
+function storedCard({ binding, contract_id: id, recorded, default_level: level, receipt_key: receipt }) {
+  const example = h("div", {});
+  if (may("enroll")) {
+    people("", { limit: 100 }).then(({ subjects }) => show(subjects), () => {});
+  }
+  function show(subjects) {
+    if (!subjects.length) return;
+    const select = h("select", { onchange: describe }, subjects.map((person) => h("option", {}, person.subject_id)));
+    const place = h("div", {});
+    async function describe() {
+      const name = select.value;
+      const person = await call("GET", subjectPath(name)).catch(() => null);
+      if (!person || select.value !== name) return;
+      place.replaceChildren(
+        facts([
+          ["Id", name],
+          ["Template", ["encrypted, ", h("code", {}, `${person.template_id.slice(0, 12)}…`)]],
+          ["Made of", person.photos ? `${person.photos} photos, which are not kept` : "a template that a client lifted"],
+          ["Enrolled", when(person.updated_at)],
+          ["Holder key", person.holder_key ? "needed, and not kept" : null],
+        ]),
+      );
+    }
+    example.replaceChildren(field("Person", select), place);
+    describe();
+  }
+  return h(
+    "section",
+    { class: "card" },
+    h("h2", {}, "What is stored"),
+    h("p", {}, "Of each person an id, dates, and one encrypted template: a set that holds the embedding among decoys. No photo, and no embedding as such. How well the set hides it is the verdict above."),
+    example,
+    folded(
+      "Geometry and contract",
+      facts([
+        ["Template", `m = ${binding.m} of ${binding.axes} axes, ${binding.strategy}; embeddings have ${binding.n}`],
+        ["Decoys", h("code", {}, binding.decoy_source_id)],
+        ["Contract", h("code", {}, id)],
+        ["Model pack", String(recorded.pack ?? "not recorded")],
+        ["Default level", level],
+        ["Receipt key", h("code", {}, receipt.public_key)],
+      ]),
     ),
+  );
+}
+
+function keyCard(own) {
+  return h(
+    "section",
+    { class: "card" },
+    h("h2", {}, "This key"),
+    facts([
+      ["Key", h("code", {}, `vf_${own.prefix}_…`)],
+      ["Tenant", own.tenant],
+      ["Expires", own.expires_at ? when(own.expires_at) : "never"],
+    ]),
     h(
-      "p",
-      { class: "hint" },
-      `${group}${rate.errors} of ${rate.trials.toLocaleString("en")}; at most ${percent(limit)} passes`,
-      shortfall ? `. Not enough to pass: ${shortfall}.` : ".",
+      "ul",
+      { class: "rights", "aria-label": "Rights" },
+      Object.entries(RIGHTS).map(([right, meaning]) => {
+        const has = own.rights.includes(right);
+        return h("li", { class: has ? "has" : "lacks" }, h("strong", {}, right), ` ${has ? "may" : "may not"} ${meaning}`);
+      }),
     ),
+  );
+}
+
+function levelTable({ mode, probe_photos: photos, probe_m: m, levels }) {
+  const many = photos === 1 ? "one photo" : `${photos} photos`;
+  return table(
+    mode === "p2s" ? `A probe of ${many}` : `A lifted probe of ${many}, m = ${m}`,
+    ["Level", "Strangers accepted: target", "Strangers accepted: counted", "Right people rejected"],
+    levels.map(({ name, target_fmr: target, fmr, fnmr }) => [
+      name,
+      target ? `${percent(target)} (${oneIn(target)})` : "none",
+      counted(fmr),
+      counted(fnmr),
+    ]),
   );
 }
 
 function counted(rate) {
   if (!rate) return "unknown";
   const value = rate.trials ? rate.errors / rate.trials : null;
-  return `${percent(value)} (${rate.errors} of ${rate.trials.toLocaleString("en")})`;
-}
-
-async function ask(place) {
-  const parts = [];
-  for (const [what, path] of [
-    ["Process", "/health/live"],
-    ["Database and model", "/health/ready"],
-  ]) {
-    try {
-      await call("GET", path);
-      parts.push([what, h("span", { class: "ok" }, "✓ up")]);
-    } catch (error) {
-      if (error.code === "not_found") parts.push([what, "on the operations port only"]);
-      else parts.push([what, problemBox(error)]);
-    }
-  }
-  place.replaceChildren(facts(parts));
+  return `${percent(value)} (${rate.errors.toLocaleString("en")} of ${rate.trials.toLocaleString("en")})`;
 }

@@ -1,5 +1,5 @@
 import { headMovements } from "./challenge.js";
-import { facts, field, h, oneIn, percent } from "./dom.js";
+import { field, folded, h, oneIn, percent, s } from "./dom.js";
 import { photoForm } from "./form.js";
 import { call, form, levels, may, moves, session, subjectPath } from "./service.js";
 import { enroller } from "./subject.js";
@@ -7,39 +7,32 @@ import { DEMO, livenessWords, problemBox } from "./words.js";
 
 const REASONS = {
   match: "The face matches the enrolled person.",
-  no_match: "No match: another person, poor photos, an id that nobody is enrolled under, or a holder key that is wrong " +
-    "or missing. Check the id, and try other photos. If a holder key is lost, enroll the person again.",
+  no_match: "No match: another person, poor photos, an unknown id, or a holder key that is wrong or missing.",
 };
-
+const HOW = {
+  drawn: "Choose the person, then a cartoon photo.",
+  movements: "You will be asked to move your head.",
+  photos: "With the camera, one click takes three photos and sends them.",
+};
 // What to do differently depends on what was asked for.
-const NOT_LIVE = "Nothing shows that a living person is before the camera. ";
-const LIVENESS = {
-  movements: NOT_LIVE + "Follow each movement as it is asked for, in good light.",
-  photos: NOT_LIVE + "Take new photos with the camera, of the face itself and in good light.",
-};
-
-const ANSWER = "The answer appears here: accepted or rejected, and how often a stranger would be accepted.";
-const STEPS = {
-  movements: ["Press Start head movements. The camera opens.", `Follow each movement for about twelve seconds. ${ANSWER}`],
-  photos: [
-    DEMO ? "Choose a photo of a cartoon person." : "Take three photos by one click, or choose up to five files.",
-    `Press Verify. ${ANSWER}`,
-  ],
+const NOT_LIVE = {
+  movements: "Nothing shows that a living person is before the camera. Follow each movement as it is asked for, in good light.",
+  photos: "Nothing shows that a living person is before the camera. Take new photos of the face itself, in good light.",
 };
 
 export function verifyView(id) {
   const level = h(
     "select",
     { onchange: () => view.refresh() },
-    levels().map((each) =>
+    levels().map(({ name, target_fmr: rate }) =>
       h(
         "option",
-        { value: each.name, selected: each.name === session.contract.default_level },
-        each.target_fmr ? `${oneIn(each.target_fmr)} (${each.name})` : each.name,
+        { value: name, selected: name === session.contract.default_level },
+        rate ? `${name}: ${oneIn(rate)} strangers` : name,
       ),
     ),
   );
-  const asked = () => (moves() ? "movements" : "photos");
+  const kind = () => (moves() ? "movements" : "photos");
 
   async function send(name, { photos, ...given }, { lifts, say }) {
     say("Comparing…");
@@ -58,18 +51,17 @@ export function verifyView(id) {
   const view = photoForm(id, {
     action: "verify",
     title: "Verify",
-    lead: "Check whether photos show the person enrolled under an id. Several are averaged.",
-    beside: field("Level", level, "How often a stranger is accepted. Stricter levels reject the right person more often."),
-    heading: "The decision",
-    steps: () => ["Choose the person.", ...STEPS[asked()]],
+    lead: "Is this the person who is enrolled under this id?",
+    beside: field("Level", level),
+    empty: () => `The decision appears here. ${HOW[DEMO ? "drawn" : kind()]}`,
     most: 5,
     replaces: true,
     level: () => level.value,
     movements: headMovements(),
     moving: moves,
-    verb: () => (moves() ? "Start head movements" : "Verify"),
+    verb: "Verify",
     send,
-    show: (name, answer) => decision(name, answer, asked()),
+    show: (name, answer) => decision(name, answer, kind()),
     remedies,
   });
   return view;
@@ -89,22 +81,38 @@ function lifter(name, problem, button) {
   return h("button", { type: "button", class: "secondary", onclick: lift }, "Lift the lock");
 }
 
-function decision(id, answer, asked) {
+function decision(id, answer, kind) {
   const accepted = answer.decision === "accept";
+  const live = livenessWords(answer);
   return h(
     "div",
     { class: `verdict ${accepted ? "accept" : "reject"}` },
     h("p", { class: "verdict-word" }, accepted ? "✓ Accepted" : "✕ Rejected"),
-    h("p", {}, REASONS[answer.reason] ?? LIVENESS[asked]),
-    answer.advice ? h("p", {}, answer.advice) : null,
-    facts([
-      ["Person", id],
-      ["Level", answer.level],
-      ["False match rate", `${percent(answer.fmr)} (${oneIn(answer.fmr)})`],
-      ["Liveness", livenessWords(answer)],
-      ["Distance", answer.distance === undefined ? null : answer.distance.toFixed(4)],
-    ]),
-    h("p", { class: "fine" }, "Reason ", h("code", {}, answer.reason), ", request ", h("code", {}, answer.request_id)),
-    answer.notice ? h("p", { class: "fine" }, answer.notice) : null,
+    h("p", {}, REASONS[answer.reason] ?? NOT_LIVE[kind], answer.advice ? ` ${answer.advice}` : ""),
+    answer.distance === undefined ? null : gauge(answer.distance, answer.distance_threshold),
+    h("p", {}, h("strong", {}, id), `, at level ${answer.level}: strangers are accepted at ${percent(answer.fmr)} (${oneIn(answer.fmr)}).`),
+    live ? h("p", {}, `Liveness: ${live}.`) : null,
+    folded(
+      "For support",
+      h("p", { class: "fine" }, "Reason ", h("code", {}, answer.reason), ", request ", h("code", {}, answer.request_id)),
+    ),
+  );
+}
+
+// The distance on a line that ends at twice the threshold.
+function gauge(distance, threshold) {
+  const at = Math.min(98, 50 * (distance / threshold || 0));
+  return h(
+    "figure",
+    { class: "gauge" },
+    h("figcaption", {}, "Distance ", h("strong", {}, distance.toFixed(3)), `, accepted up to ${threshold.toFixed(3)}`),
+    s(
+      "svg",
+      { viewBox: "0 0 100 8", preserveAspectRatio: "none", "aria-hidden": "true" },
+      s("rect", { class: "gauge-line", x: 0, y: 3, width: 100, height: 2 }),
+      s("rect", { class: "gauge-within", x: 0, y: 3, width: 50, height: 2 }),
+      s("rect", { class: "gauge-limit", x: 49.8, y: 0, width: 0.4, height: 8 }),
+      s("rect", { class: "gauge-here", x: at, y: 0, width: 2, height: 8 }),
+    ),
   );
 }

@@ -15,7 +15,7 @@ const REMEDIES = {
   request_too_large: "Send fewer or smaller photos.",
   too_many_images: "Send fewer photos.",
   no_face: "Come closer, and take a photo that shows the face upright and uncovered.",
-  multiple_faces: "Come closer, into the middle, or tick the box that takes the largest face.",
+  multiple_faces: "Come closer, into the middle, or take the largest face, under Options.",
   face_too_small: "Move closer, or send a larger photo.",
   low_quality: "Take another photo.",
   inconsistent_images: "Remove the photos that show somebody else or look very different.",

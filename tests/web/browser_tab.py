@@ -1,10 +1,11 @@
 """A browser tab, and a record of it: what the browser asked for, and what it complained of."""
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from playwright.sync_api import BrowserContext, Page, expect
+from playwright.sync_api import BrowserContext, FilePayload, Page, expect
 
 from tests.patience import wait_until
 
@@ -86,12 +87,55 @@ class BrowserTab:
         self.page.get_by_role("navigation", name="Views").get_by_role("link", name=view).click()
         expect(self.page.get_by_role("heading", level=1)).to_be_focused()
 
-    def take_photos(self) -> None:
-        """Start the camera, and take a burst by one click."""
+    def press(self, name: str) -> None:
+        """Press the button of this very name."""
+        self.page.get_by_role("button", name=name, exact=True).click()
+
+    def name_person(self, subject: str) -> None:
+        """Type a person's id."""
+        self.page.get_by_label("Person’s id").fill(subject)
+
+    def start_camera(self) -> None:
+        """Take photos from the camera, and start it."""
         self.page.get_by_label("Camera", exact=True).check()
-        self.page.get_by_role("button", name="Start camera").click()
-        self.page.get_by_role("button", name="Take 3 photos").click()
-        expect(self.page.locator(".tray .seen").last).not_to_have_text("Checking…")
+        self.press("Start camera")
+        expect(self.page.locator("video:visible")).to_have_count(1)
+
+    def choose_files(self, *photos: Path | FilePayload) -> None:
+        """Choose files, whatever will be said of them."""
+        self.page.get_by_label("Files", exact=True).check()
+        self.page.get_by_label("Choose photos").set_input_files(list(photos))  # type: ignore[arg-type]
+
+    def choose_drawn(self, person: str, shot: int) -> None:
+        """Take one photo of a drawn person, which will do."""
+        self.page.get_by_label("Cartoon people", exact=True).check()
+        self.page.get_by_label("Cartoon person").select_option(person)
+        self.press(f"Choose photo {shot} of {person}")
+        self.good(None)
+
+    def lock_by(self, lock: str) -> None:
+        """Choose the holder key, among the options."""
+        details = self.page.locator("details").first
+        if not details.evaluate("(each) => each.open"):
+            details.locator("summary").click()
+        self.page.get_by_role("radio", name=lock, exact=True).check()
+
+    def good(self, count: int | None) -> None:
+        """Wait until this many chosen photos will do, or the last one."""
+        good = self.page.locator(".tray .seen[data-state=good]")
+        if count is None:
+            expect(self.page.locator(".tray .seen").last).to_have_attribute("data-state", "good")
+        else:
+            expect(good).to_have_count(count)
+
+    def is_decided(self, decision: str) -> None:
+        """Wait for the decision ``accept`` or ``reject``."""
+        expect(self.page.locator(f".verdict.{decision}")).to_be_visible()
+
+    def is_refused(self, *words: str) -> None:
+        """Wait for a problem that says all of this."""
+        for each in words:
+            expect(self.page.get_by_role("alert")).to_contain_text(each)
 
     def guided(self, text: str) -> None:
         """Wait for the live guidance to say this."""

@@ -26,14 +26,13 @@ from PIL import Image
 from playwright.sync_api import Browser
 
 from tests.conftest import DEFAULT_SHARED_DATA
+from tests.web import walk
 from tests.web.access import SIZES, looks
 from tests.web.browser_tab import BrowserTab
 from tests.web.camera import FakeCamera
 from tests.web.conftest import installed_browser, running_browser
 from tests.web.deployments import OTHER, WHO, demo_service, moving_service, real_service
 from tests.web.served import Served
-from tests.web.walk import walk_demo, walk_real
-from tests.web.walk_obstacles import walk_challenge, walk_obstacles, walk_passkeys
 
 Walk = Callable[[BrowserTab, Served], Iterator[str]]
 
@@ -55,7 +54,7 @@ class Pictures:
         context = browser.new_context(viewport={"width": width, "height": height})
         # Passkeys belong to a name.
         tab = BrowserTab.of(context, served.url.replace("127.0.0.1", "localhost") + "/")
-        for number, name in enumerate(walk(tab, served), start=1):
+        for name in walk(tab, served):
             if self.docs and name == SHOWN_IN_DOCS:
                 self._take_for_docs(tab)
                 break
@@ -63,7 +62,7 @@ class Pictures:
                 for look in looks(tab.page):
                     folder = self.out / look
                     folder.mkdir(parents=True, exist_ok=True)
-                    (folder / f"{number:02}-{name}.png").write_bytes(picture_of(tab))
+                    (folder / f"{name}.png").write_bytes(picture_of(tab))
         context.close()
 
     def _take_for_docs(self, tab: BrowserTab) -> None:
@@ -95,19 +94,22 @@ def main() -> None:
         camera = FakeCamera(work / "camera.mjpeg")
         browser = stack.enter_context(running_browser(Path(executable), *camera.flags))
         demo = stack.enter_context(demo_service(work / "demo"))
-        pictures.take(browser, walk_demo, demo)
         if pictures.docs:
+            pictures.take(browser, walk.walk_verify, demo)
             return
-        pictures.take(browser, walk_obstacles, demo)
-        pictures.take(browser, walk_passkeys, demo)
-        moving = stack.enter_context(moving_service(work / "moving"))
-        pictures.take(browser, walk_challenge, moving)
+        for each in (*walk.DEMO_WALKS, walk.walk_passkeys):
+            pictures.take(browser, each, demo)
+        pictures.take(
+            browser,
+            walk.walk_challenge,
+            stack.enter_context(moving_service(work / "moving")),
+        )
         if data.exists():
             lfw, pack = data / "lfw", data / "packs" / "w600k_mbf"
             real = stack.enter_context(real_service(work / "real", pack, lfw / "aligned112"))
-            faces = [sorted((lfw / "photos" / name).glob("*.jpg")) for name in (WHO, OTHER)]
-            walk = partial(walk_real, camera=camera, own=faces[0], other=faces[1])
-            pictures.take(browser, walk, real)
+            own, other = (sorted((lfw / "photos" / name).glob("*.jpg")) for name in (WHO, OTHER))
+            faces = partial(walk.walk_real, camera=camera, own=own, other=other)
+            pictures.take(browser, faces, real)
 
 
 if __name__ == "__main__":

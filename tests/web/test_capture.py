@@ -7,11 +7,14 @@ from typing import Any
 
 import pytest
 from PIL import Image
-from playwright.sync_api import expect
+from playwright.sync_api import FilePayload, expect
 
+from tests.web.access import assert_accessible
+from tests.web.answers import refused
 from tests.web.browser_tab import BrowserTab
 from tests.web.camera import FakeCamera
 from tests.web.conftest import OpenTab
+from tests.web.deployments import OTHER, WHO
 from tests.web.served import Served
 
 pytestmark = pytest.mark.long
@@ -58,29 +61,35 @@ async () => Promise.all(window.sent.map(async ([path, blob]) => {
   return {path, type: blob.type, width: bitmap.width, height: bitmap.height, text: bytes.join()};
 }))
 """
+BLACK = """
+window.shots = [];
+const encode = HTMLCanvasElement.prototype.toBlob;
+HTMLCanvasElement.prototype.toBlob = function (...given) {
+  if (this.width > 480) {
+    window.shots.push(performance.now());
+    if (window.shots.length === 2) this.getContext("2d").fillRect(0, 0, this.width, this.height);
+  }
+  return encode.apply(this, given);
+};
+"""
 
 
-def watched(open_tab: OpenTab, served: Served) -> BrowserTab:
-    tab = open_tab(served, sign_in=None)
+def watched(open_tab: OpenTab, served: Served, **options: int) -> BrowserTab:
+    tab = open_tab(served, sign_in=None, **options)
     tab.page.add_init_script(WATCH)
     tab.sign_in(served.token)
     return tab
 
 
-def start(tab: BrowserTab) -> None:
-    tab.page.get_by_label("Camera", exact=True).check()
-    tab.page.get_by_role("button", name="Start camera").click()
-
-
-def leave(tab: BrowserTab, how: str, token: str) -> None:
+def leave(tab: BrowserTab, how: str) -> None:
     """Leave the view in one of three ways; the camera was this view's."""
     match how:
         case "view":
             tab.open("People")
         case "source":
-            tab.page.get_by_label("Files").check()
+            tab.page.get_by_label("Files", exact=True).check()
         case _:
-            tab.page.get_by_role("button", name="Sign out").click()
+            tab.press("Sign out")
             expect(tab.page.get_by_role("heading", level=1, name="Sign in")).to_be_visible()
 
 
@@ -99,11 +108,12 @@ def test_nothing_is_sent_once_the_camera_was_left(open_tab: OpenTab, demo: Serve
     for number, how in enumerate(("view", "source", "sign-out"), start=1):
         # Left while the video is about to play.
         tab.open("Service")
-        tab.open("Verify")
+        tab.open("Enroll")
         page.evaluate("() => { window.playing = new Promise((done) => { window.goOn = done; }); }")
-        start(tab)
+        page.get_by_label("Camera", exact=True).check()
+        tab.press("Start camera")
         tab.wait_for("count => window.tracks.length === count", number)
-        leave(tab, how, demo.token)
+        leave(tab, how)
         page.evaluate("window.goOn()")
         tab.wait_for("() => window.tracks.every((track) => track.readyState === 'ended')")
     page.wait_for_timeout(1200)
@@ -111,9 +121,9 @@ def test_nothing_is_sent_once_the_camera_was_left(open_tab: OpenTab, demo: Serve
     for how in ("view", "sign-out"):
         # Left while frames go out.
         tab.sign_in(demo.token)
-        start(tab)
+        tab.start_camera()
         expect(page.locator(".guidance:not([data-state=idle])")).to_be_visible()
-        leave(tab, how, demo.token)
+        leave(tab, how)
         assert set(states(tab)) == {"ended"}
         sent = checks(tab)
         assert sent > 0
@@ -128,7 +138,7 @@ def test_a_camera_that_stops_is_said_and_can_be_started_again(
     page = tab.page
     button = page.get_by_role("button", name="Start camera")
     for event in ("ended", "mute", "pagehide"):
-        start(tab)
+        tab.start_camera()
         expect(button).to_be_hidden()
         page.evaluate(
             "name => (name === 'pagehide' ? window : window.tracks.at(-1))"
@@ -139,49 +149,87 @@ def test_a_camera_that_stops_is_said_and_can_be_started_again(
         expect(button).to_be_focused()
         expect(page.locator("video:visible")).to_have_count(0)
         assert set(states(tab)) == {"ended"}
-    start(tab)
-    expect(page.get_by_role("button", name="Take 3 photos")).to_be_visible()
+    asked: list[str] = []
+    wait = refused(429, "rate_limited", "too many requests", wait=30)
+    page.route("**/v1/photos/check", lambda route: (asked.append("check"), route.fulfill(**wait)))
+    tab.start_camera()
     assert states(tab)[-1] == "live"
+    # It waits as long as it is told.
+    tab.guided("Guidance is paused: too many requests.")
+    page.wait_for_timeout(2500)
+    assert asked == ["check"]
 
 
-def test_the_photo_that_is_sent_was_itself_checked(
+@pytest.mark.parametrize(
+    ("shown", "dark", "words"),
+    [
+        ((), 1, "No face found"),
+        ((WHO, OTHER), 1, "2 faces found"),
+        ((WHO,), 0.14, "Too dark"),
+        ((WHO,), 1, "Good: one face"),
+    ],
+)
+def test_guidance_says_what_the_camera_shows(
+    open_tab: OpenTab,
+    real: Served,
+    camera: FakeCamera,
+    people: dict[str, list[Path]],
+    shown: tuple[str, ...],
+    dark: float,
+    words: str,
+) -> None:
+    camera.shows(*(people[name][0] for name in shown), dark=dark)
+    tab = open_tab(real, width=360)
+    tab.start_camera()
+    tab.guided(words)
+    assert_accessible(tab, words)
+    expect(tab.page.locator(".found")).to_be_visible(visible=words.startswith("Good"))
+
+
+def test_the_photos_that_are_sent_were_checked_themselves(
     open_tab: OpenTab, real: Served, camera: FakeCamera, people: dict[str, list[Path]]
 ) -> None:
-    camera.shows(people["Ashanti"][0])
+    """One click of Verify takes a burst and sends it; the second photo would not do."""
+    camera.shows(people[WHO][0])
     tab = watched(open_tab, real)
     page = tab.page
-    page.get_by_label("Person's id").fill("nobody-there")
-    tab.take_photos()
-    expect(page.locator(".tray .seen[data-state=good]")).to_have_count(3)
-    page.get_by_role("button", name="Verify", exact=True).click()
-    expect(page.get_by_role("alert")).to_contain_text("not_enrolled")
-    taken = page.evaluate(SENT)
-    assert_sent_as_checked(taken, (640, 480), photos=3)
-    assert {(each["width"], each["height"]) for each in taken} == {(640, 480), (480, 360)}
+    tab.name_person("nobody-there")
+    tab.start_camera()
+    tab.guided("Good: one face")
+    page.evaluate(f"() => {{ {BLACK} }}")
+    tab.press("Verify")
+    tab.is_refused("not_enrolled")
+    expect(page.locator(".refused")).to_have_text(f"2 of 3 photos taken. {NO_FACE}")
+    tab.good(2)
+    times = page.evaluate("window.shots")
+    assert len(times) == 3
+    assert min(later - earlier for earlier, later in pairwise(times)) > 250
+    assert_sent_as_checked(page.evaluate(SENT), (640, 480), photos=2)
+    # Of a burst that will not do, nothing is sent.
+    sent = sum(url.endswith("/verify") for url in tab.requests)
+    camera.shows()
+    page.get_by_label("Files", exact=True).check()
+    tab.start_camera()
+    tab.press("Verify")
+    expect(page.locator(".refused")).to_have_text(f"None of 3 photos taken. {NO_FACE}")
+    assert sum(url.endswith("/verify") for url in tab.requests) == sent
 
     # A large photo is made smaller once; one that is small stays as it is, byte for byte.
-    small = people["Ashanti"][1].read_bytes()
+    small = people[WHO][1].read_bytes()
     large = io.BytesIO()
     Image.open(io.BytesIO(small)).resize((2400, 1800)).save(large, "JPEG")
-    page.get_by_label("Files").check()
     for data, size in ((large.getvalue(), (1600, 1200)), (small, (250, 250))):
         page.evaluate("window.sent.length = 0")
-        file: Any = {"name": "photo.jpg", "mimeType": "image/jpeg", "buffer": data}
-        page.get_by_label("Photos: JPEG").set_input_files(file)
-        expect(page.locator(".tray .seen[data-state=good]")).to_have_count(1)
-        page.get_by_role("button", name="Verify", exact=True).click()
-        expect(page.get_by_role("alert")).to_contain_text("not_enrolled")
+        tab.choose_files(jpeg("photo.jpg", data))
+        tab.good(1)
+        tab.press("Verify")
+        tab.is_refused("not_enrolled")
         assert_sent_as_checked(page.evaluate(SENT), size)
     assert page.evaluate(SENT)[-1]["text"] == ",".join(map(str, small))
 
-    # A photo that would be refused is not taken.
-    camera.shows()
-    page.get_by_label("Camera", exact=True).check()
-    page.get_by_role("button", name="Remove photo").click()
-    page.get_by_role("button", name="Start camera").click()
-    page.get_by_role("button", name="Take 3 photos").click()
-    expect(page.locator(".refused")).to_have_text(f"None of 3 photos taken. {NO_FACE}")
-    expect(page.locator(".tray li")).to_have_count(0)
+
+def jpeg(name: str, data: bytes) -> FilePayload:
+    return {"name": name, "mimeType": "image/jpeg", "buffer": data}
 
 
 def assert_sent_as_checked(
@@ -190,72 +238,29 @@ def assert_sent_as_checked(
     # The camera goes on, so that a frame may be checked after the photos were sent.
     sending = [n for n, each in enumerate(sent) if each["path"].endswith("/verify")]
     assert len(sending) == photos
-    checked = [each for each in sent[: sending[0]] if each["path"] == "/v1/photos/check"]
+    checked = [each for each in sent[: sending[0]] if each["path"].endswith("/v1/photos/check")]
     for number in sending:
         assert (sent[number]["width"], sent[number]["height"]) == size
         assert sent[number]["text"] in {each["text"] for each in checked}
 
 
-BLACK = """
-window.shots = [];
-const encode = HTMLCanvasElement.prototype.toBlob;
-HTMLCanvasElement.prototype.toBlob = function (...given) {
-  if (this.width > 480) {
-    window.shots.push(performance.now());
-    if (window.shots.length === 2) this.getContext("2d").fillRect(0, 0, this.width, this.height);
-  }
-  return encode.apply(this, given);
-};
-"""
-
-
-def test_one_click_takes_three_photos_and_drops_what_would_not_do(
-    open_tab: OpenTab, real: Served, camera: FakeCamera, people: dict[str, list[Path]]
-) -> None:
-    camera.shows(people["Ashanti"][0])
-    tab = watched(open_tab, real)
-    page = tab.page
-    tab.open("Enroll")
-    start(tab)
-    tab.guided("Good: one face")
-    page.evaluate(f"() => {{ {BLACK} }}")
-    page.get_by_role("button", name="Take 3 photos").click()
-    expect(page.locator(".tray .seen[data-state=good]")).to_have_count(2)
-    expect(page.locator(".refused")).to_have_text(f"2 of 3 photos taken. {NO_FACE}")
-    expect(page.get_by_role("button", name="Take 3 photos")).to_be_enabled()
-    times = page.evaluate("window.shots")
-    assert len(times) == 3
-    assert min(later - earlier for earlier, later in pairwise(times)) > 250
-    # In an enrollment a second burst is added to the first.
-    page.get_by_role("button", name="Take 3 photos").click()
-    expect(page.locator(".tray .seen[data-state=good]")).to_have_count(5)
-    expect(page.locator(".refused")).to_be_empty()
-
-
 def test_photos_are_decoded_one_at_a_time(open_tab: OpenTab, demo: Served) -> None:
     out = io.BytesIO()
-    Image.open(demo.settings.data_dir / "people" / "person-2" / "0.png").resize((1700, 1700)).save(
-        out, "JPEG"
-    )
+    drawn = demo.settings.data_dir / "people" / "person-2" / "0.png"
+    Image.open(drawn).resize((1700, 1700)).save(out, "JPEG")
     tab = watched(open_tab, demo)
     page = tab.page
     tab.open("Enroll")
-    page.get_by_label("Files").check()
-    page.get_by_label("Photos: JPEG").set_input_files(
-        [{"name": f"{n}.jpg", "mimeType": "image/jpeg", "buffer": out.getvalue()} for n in range(4)]
-    )
-    expect(page.locator(".tray .seen[data-state=good]")).to_have_count(4)
+    tab.choose_files(*(jpeg(f"{n}.jpg", out.getvalue()) for n in range(4)))
+    tab.good(4)
     assert page.evaluate("window.bitmaps") == {"open": 0, "most": 1, "all": 4}
     # A browser that cannot make the smaller copy sends the photo, and says why it takes no frame.
     page.evaluate("() => { HTMLCanvasElement.prototype.toBlob = (done) => done(null); }")
-    page.get_by_label("Photos: JPEG").set_input_files(
-        {"name": "5.jpg", "mimeType": "image/jpeg", "buffer": out.getvalue()}
-    )
-    expect(page.locator(".tray .seen[data-state=good]")).to_have_count(5)
+    tab.choose_files(jpeg("5.jpg", out.getvalue()))
+    tab.good(5)
     assert page.evaluate("window.bitmaps.open") == 0
-    page.get_by_label("Camera", exact=True).check()
-    page.get_by_role("button", name="Start camera").click()
-    page.get_by_role("button", name="Take 3 photos").click()
+    tab.start_camera()
+    tab.press("Take 3 photos")
     expect(page.locator(".refused")).to_have_text(
         "None of 3 photos taken. The browser could not take a photo."
     )

@@ -19,7 +19,7 @@ from tests.web.conftest import OpenTab
 from tests.web.deployments import ANNA
 from tests.web.moving_head import camera_script
 from tests.web.served import Served, serving
-from tests.web.walk_obstacles import START
+from tests.web.walk import START
 from veilface_client import Client
 
 pytestmark = pytest.mark.long
@@ -58,7 +58,7 @@ def opened(open_tab: OpenTab, served: Served, shown: str | None = None) -> Brows
     if shown is not None:
         tab.page.add_init_script(camera_script(shown, person=ANNA))
     tab.sign_in(served.token)
-    tab.page.get_by_label("Person's id").fill("anna")
+    tab.name_person("anna")
     return tab
 
 
@@ -68,7 +68,7 @@ def test_who_follows_the_movements_is_accepted(open_tab: OpenTab, moving: Served
     expect(page.locator(".picker")).to_be_hidden()
     expect(page.get_by_text("cannot turn your head, ask the operator")).to_be_visible()
     with page.expect_response(re.compile("/v1/challenges$")) as given:
-        page.get_by_role("button", name=START).click()
+        tab.press(START)
     expect(page.locator(".movement")).to_be_visible()
     expect(page.locator(".outline")).to_be_visible()
     asked = given.value.json()["movements"]
@@ -96,7 +96,7 @@ def test_who_sits_still_or_turns_the_wrong_way_is_rejected(
         (wrong, re.compile("a movement was not seen|another order")),
     ):
         tab = opened(open_tab, moving, shown)
-        tab.page.get_by_role("button", name=START).click()
+        tab.press(START)
         expect(tab.page.locator(".verdict.reject")).to_contain_text(why)
         expect(tab.page.locator(".verdict")).to_contain_text("a living person")
         expect(tab.page.locator(".verdict")).to_contain_text("Follow each movement")
@@ -109,7 +109,7 @@ def test_a_photo_before_the_browsers_own_camera_is_rejected(
     Image.fromarray(draw(head(), ANNA)).resize((SIZE[1], SIZE[1])).save(still)
     camera.shows(still)
     tab = opened(open_tab, moving)
-    tab.page.get_by_role("button", name=START).click()
+    tab.press(START)
     expect(tab.page.locator(".verdict.reject")).to_contain_text("the head did not turn")
 
 
@@ -125,10 +125,10 @@ def test_who_sends_photos_is_not_told_to_move(
         with served.client() as client:
             files = images(frame(person=ANNA))
             assert client.put("/v1/subjects/anna/enrollment", files=files).status_code == 201
-        page = opened(open_tab, served).page
-        page.get_by_label("Files").check()
-        page.get_by_label("Photos: JPEG").set_input_files(dark)
-        page.get_by_role("button", name="Verify", exact=True).click()
+        tab = opened(open_tab, served)
+        page = tab.page
+        tab.choose_files(dark)
+        tab.press("Verify")
         expect(page.locator(".verdict.reject")).to_contain_text("Take new photos")
         expect(page.locator(".verdict")).not_to_contain_text("movement")
 
@@ -136,7 +136,7 @@ def test_who_sends_photos_is_not_told_to_move(
 def test_leaving_ends_the_camera_and_sends_nothing(open_tab: OpenTab, moving: Served) -> None:
     tab = opened(open_tab, moving, "(asked) => asked")
     page = tab.page
-    page.get_by_role("button", name=START).click()
+    tab.press(START)
     expect(page.locator(".movement")).to_be_visible()
     tab.open("People")
     assert page.evaluate("window.cameraTrack.readyState") == "ended"

@@ -12,11 +12,11 @@ import pytest
 from PIL import Image
 from playwright.sync_api import Browser, expect
 
-from benchmarks.browser_client import requests_in
 from models.pack import ModelPack
 from tests.clients.conftest import Running
 from tests.clients.javascript.conftest import require_client
 from tests.clients.javascript.test_docs import EXAMPLE, OF_THE_CLIENT, OF_THE_ELEMENT
+from tests.clients.recorded import requests_in
 from tests.leaks import LeakSearch, as_bytes
 from tests.web.browser_tab import BrowserTab
 from tests.web.camera import FakeCamera

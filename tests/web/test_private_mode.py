@@ -9,21 +9,21 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Page, Route, expect
 
-from benchmarks.browser_client import faces_of, requests_in
-from benchmarks.people import Person
 from models.pack import ModelPack
 from tests.clients.conftest import Running
 from tests.clients.javascript.conftest import require_client
 from tests.clients.proxy import Proxy
+from tests.clients.recorded import faces_of, requests_in
 from tests.leaks import as_bytes
 from tests.patience import wait_until
 from tests.web.access import assert_accessible
+from tests.web.browser_tab import BrowserTab
 from tests.web.camera import FakeCamera
 from tests.web.conftest import OpenTab
 from tests.web.deployments import OTHER, WHO
 from tests.web.passkeys import Authenticator
 from tests.web.served import Served
-from tests.web.walk_obstacles import TO_PASSKEY
+from tests.web.walk import TO_PASSKEY, walk_private
 
 pytestmark = pytest.mark.long
 CHECK_WHAT_FAILS = """async () => {
@@ -46,6 +46,12 @@ COUNT_LOOKS = """() => {
     return toBlob.apply(this, given);
   };
 }"""
+
+
+def choose(tab: BrowserTab, *photos: Path) -> None:
+    """Choose files that will do, in the place of those before or beside them."""
+    tab.choose_files(*photos)
+    tab.good(len(photos))
 
 
 @pytest.fixture
@@ -72,23 +78,22 @@ def served(running: Running, recording: Proxy) -> Served:
     return there
 
 
-def choose(page: Page, *photos: Path) -> None:
-    page.get_by_label("Files", exact=True).check()
-    page.get_by_label("Photos: JPEG").set_input_files(photos)
-    expect(page.locator(".tray .seen[data-state=good]")).to_have_count(len(photos))
-
-
-def press(page: Page, name: str) -> None:
-    page.get_by_role("button", name=name, exact=True).click()
-
-
-def told_of(page: Page) -> list[list[str]]:
+def fields_that_left(page: Page) -> list[list[str]]:
     """What the page says that left it: request, field, size."""
     # After an error, what left is told as well.
     expect(page.locator(".verdict")).to_be_visible()
+    page.get_by_text("Every field that was sent").click()
     rows = page.locator("[data-left] tbody tr")
     expect(rows.first).to_be_visible()
     return [row.locator("th, td").all_inner_texts() for row in rows.all()]
+
+
+def test_axe_finds_nothing_in_private_mode(
+    served: Served, open_tab: OpenTab, camera: FakeCamera, people: dict[str, list[Path]]
+) -> None:
+    tab = open_tab(served, sign_in=None)
+    for name in walk_private(tab, served, camera, people[WHO]):
+        assert_accessible(tab, name)
 
 
 def test_a_face_never_leaves_the_browser(
@@ -106,32 +111,31 @@ def test_a_face_never_leaves_the_browser(
     Authenticator.of(page)
     tab.open("Enroll")
     expect(page.get_by_role("switch", name="Private mode")).to_be_checked()
-    page.get_by_label("Person's id").fill("anna")
-    tab.take_photos()
+    tab.name_person("anna")
+    tab.start_camera()
     tab.guided("Good: one face")
+    tab.press("Take 3 photos")
     expect(page.locator(".tray .found:not([hidden])")).to_have_count(3)
-    page.get_by_label("Files", exact=True).check()
-    page.get_by_label("Photos: JPEG").set_input_files(own[1])
-    expect(page.locator(".tray .seen[data-state=good]")).to_have_count(4)
-    page.get_by_label(TO_PASSKEY).check()
-    press(page, "Enroll")
+    tab.choose_files(own[1])
+    tab.good(4)
+    tab.lock_by(TO_PASSKEY)
+    tab.press("Enroll")
     expect(page.locator(".verdict")).to_contain_text("Enrolled")
     expect(page.locator(".verdict")).to_contain_text("Holder keyneeded at every verification")
-    enrolled = told_of(page)
-    assert_accessible(tab, "enrolled-privately")
+    enrolled = fields_that_left(page)
 
     page.get_by_role("link", name="Verify this person").click()
     # Else the files may be chosen in the view that is about to go.
     expect(page.get_by_role("heading", name="Verify", exact=True)).to_be_visible()
-    choose(page, own[2])
-    expect(page.get_by_label("Passkey", exact=True)).to_be_checked()
-    press(page, "Verify")
+    choose(tab, own[2])
+    expect(page.get_by_role("radio", name="Passkey", exact=True)).to_be_checked()
+    tab.press("Verify")
     expect(page.locator(".verdict.accept")).to_contain_text("Accepted")
-    told_of(page)
-    choose(page, other[0])
-    press(page, "Verify")
+    fields_that_left(page)
+    choose(tab, other[0])
+    tab.press("Verify")
     expect(page.locator(".verdict.reject")).to_contain_text("Rejected")
-    verified = told_of(page)
+    verified = fields_that_left(page)
 
     sent = recording.sent
     calls, rest = requests_in(sent)
@@ -154,8 +158,7 @@ def test_a_face_never_leaves_the_browser(
     (size,) = (each[2] for each in enrolled if each[1] == "template")
     assert size == f"{len(template):,} bytes"
 
-    persons = [Person(WHO, own[:3], []), Person(OTHER, other[:1], [])]
-    search = faces_of(pack, persons)
+    search = faces_of(pack, {WHO: own[:3], OTHER: other[:1]})
     assert search.find(sent) == []
     embedding = pack.embed_photo(own[1].read_bytes()).embedding
     for planted in (as_bytes(embedding, "float32", little=True), own[1].read_bytes()):
@@ -183,21 +186,22 @@ def test_the_same_photos_are_lifted_once(
     tab = open_tab(served)
     page = tab.page
     tab.open("Enroll")
-    page.get_by_label("Person's id").fill("anna")
+    tab.name_person("anna")
     for photos in (own[:1], own[1:3]):
-        choose(page, *photos)
-        press(page, "Enroll")
+        choose(tab, *photos)
+        tab.press("Enroll")
         if photos == own[:1]:
             expect(page.locator(".verdict")).to_contain_text("Earlier enrollmentnone")
     dialog = page.get_by_role("dialog", name="Replace anna’s enrollment?")
     dialog.get_by_role("button", name="Keep").click()
-    press(page, "Enroll")
+    tab.press("Enroll")
     dialog.get_by_role("button", name="Replace").click()
     expect(page.locator(".verdict")).to_contain_text("Earlier enrollmentreplaced")
     # Chosen anew, in another order, and by another policy for faces.
+    page.get_by_text("Options:").click()
     page.get_by_label("Others are in the picture").check()
-    choose(page, own[2], own[1])
-    press(page, "Enroll")
+    choose(tab, own[2], own[1])
+    tab.press("Enroll")
     dialog.get_by_role("button", name="Replace").click()
     expect(page.locator(".verdict")).to_contain_text("Earlier enrollmentreplaced")
     first, *again = [
@@ -210,16 +214,16 @@ def test_the_same_photos_are_lifted_once(
     page.get_by_role("link", name="Verify this person").click()
     # Else the files may be chosen in the view that is about to go.
     expect(page.get_by_role("heading", name="Verify", exact=True)).to_be_visible()
-    choose(page, own[1])
-    press(page, "Verify")
+    choose(tab, own[1])
+    tab.press("Verify")
     alert = page.get_by_role("alert")
     expect(alert).to_contain_text("This photo was used to enroll already")
     expect(alert).to_contain_text("Choose another photo.")
     expect(page.locator(".tray .seen[data-state=bad]")).to_contain_text("used to enroll")
     for photo in (own[3], own[4], own[3]):
-        choose(page, photo)
-        press(page, "Verify")
-        told_of(page)
+        choose(tab, photo)
+        tab.press("Verify")
+        fields_that_left(page)
     probes = [
         each["template"] for each in bodies_of(recording.sent, "POST /v1/subjects/anna/verify")
     ]
@@ -250,13 +254,13 @@ def test_signing_out_ends_an_attempt_and_forgets_the_switch(
     page = tab.page
     switch = page.get_by_role("switch", name="Private mode")
     tab.open("Enroll")
-    page.get_by_label("Person's id").fill("a-person-who-signs-out")
-    choose(page, people[WHO][0])
+    tab.name_person("a-person-who-signs-out")
+    choose(tab, people[WHO][0])
     page.evaluate(HOLD_PICTURES)
     button = page.locator("form button[type=submit]").element_handle()
-    press(page, "Enroll")
+    tab.press("Enroll")
     tab.wait_for("window.release !== undefined")
-    page.get_by_role("button", name="Sign out").click()
+    tab.press("Sign out")
     expect(page.get_by_label("API key")).to_be_visible()
     recording.forget()
     page.evaluate("window.release()")
@@ -264,17 +268,18 @@ def test_signing_out_ends_an_attempt_and_forgets_the_switch(
     assert b"/v1/tokens" not in recording.sent
     assert b"a-person-who-signs-out" not in recording.sent
 
-    sign_in_again(page, served)
+    sign_in_again(tab, served)
     expect(switch).to_be_checked()
     switch.uncheck()
-    page.get_by_role("button", name="Sign out").click()
-    sign_in_again(page, served)
+    tab.press("Sign out")
+    sign_in_again(tab, served)
     expect(switch).to_be_checked()
 
 
-def sign_in_again(page: Page, served: Served) -> None:
+def sign_in_again(tab: BrowserTab, served: Served) -> None:
+    page = tab.page
     page.get_by_label("API key").fill(served.token)
-    press(page, "Sign in")
+    tab.press("Sign in")
     expect(page.get_by_role("navigation", name="Views")).to_be_visible()
 
 
@@ -288,15 +293,15 @@ def test_refusals_have_the_words_of_the_service(
     alert = page.get_by_role("alert")
     bad = page.locator(".tray .seen[data-state=bad]")
     tab.open("Enroll")
-    page.get_by_label("Person's id").fill("anna")
-    choose(page, people[WHO][0], people[OTHER][0])
-    press(page, "Enroll")
+    tab.name_person("anna")
+    choose(tab, people[WHO][0], people[OTHER][0])
+    tab.press("Enroll")
     expect(alert).to_contain_text("Photos 1 and 2 do not look like the same person")
     expect(alert).to_contain_text("inconsistent_images")
     expect(bad).to_have_count(2)
-    page.get_by_label("Photos: JPEG").set_input_files(text)
+    tab.choose_files(text)
     expect(bad.last).to_contain_text("not a picture")
-    press(page, "Enroll")
+    tab.press("Enroll")
     expect(alert).to_contain_text("Photo 3 of 3: the file is not a picture")
     expect(alert).to_contain_text("unsupported_image")
     expect(alert).to_contain_text("Send a JPEG, PNG or WebP photo.")
@@ -330,7 +335,7 @@ def test_what_private_mode_cannot_serve_goes_to_the_service_and_that_is_said(
     page.route("**/v1/contract", without_a_level)
     tab.sign_in(served.token)
     switch = page.get_by_role("switch", name="Private mode")
-    page.get_by_label("Person's id").fill("anna")
+    tab.name_person("anna")
     level = page.get_by_label("Level")
     level.select_option("fmr-1e-3")
     expect(switch).to_be_disabled()
@@ -339,9 +344,9 @@ def test_what_private_mode_cannot_serve_goes_to_the_service_and_that_is_said(
     expect(said).to_contain_text("cannot serve this level: it is not calibrated")
     expect(said).to_contain_text("Photos are sent to the service")
     assert_accessible(tab, "private-mode-off")
-    choose(page, people[WHO][1])
+    choose(tab, people[WHO][1])
     recording.forget()
-    press(page, "Verify")
+    tab.press("Verify")
     expect(page.locator(".verdict.accept")).to_be_visible()
     expect(page.locator("[data-left]")).to_have_count(0)
     assert people[WHO][1].read_bytes() in recording.sent
@@ -349,20 +354,19 @@ def test_what_private_mode_cannot_serve_goes_to_the_service_and_that_is_said(
     level.select_option("fmr-1e-2")
     expect(switch).to_be_checked()
     recording.forget()
-    press(page, "Verify")
-    told = told_of(page)
+    tab.press("Verify")
+    told = fields_that_left(page)
     assert people[WHO][1].read_bytes() not in recording.sent
     # The photo had been sent before, to be checked and to be verified, and that is not denied.
     expect(page.locator("[data-left]")).to_contain_text("Photos were sent")
     photo = f"{people[WHO][1].stat().st_size:,} bytes"
     assert ["POST /v1/photos/check", "image, a photo", photo] in told
     assert ["POST /v1/subjects/anna/verify", "images, a photo", photo] in told
-    press(page, "Verify")
+    tab.press("Verify")
     expect(page.locator("[data-left]")).to_contain_text("No photo and no embedding was sent.")
     # What the promise was given for is not sent without it, by a change of the level alone.
     camera.shows(people[WHO][0])
-    page.get_by_label("Camera", exact=True).check()
-    page.get_by_role("button", name="Start camera").click()
+    tab.start_camera()
     tab.guided("Good: one face")
     recording.forget()
     level.select_option("fmr-1e-3")
@@ -445,14 +449,13 @@ def test_what_keeps_private_mode_from_working_is_said_and_nothing_else_is_sent(
 
     page.route(re.compile(r"/v1/pack/[0-9a-f]{64}$"), altered)
     camera.shows(people[WHO][0])
-    page.get_by_role("button", name="Start camera").click()
+    tab.start_camera()
     tab.guided("Guidance is unavailable right now")
     page.evaluate(COUNT_LOOKS)
     tab.wait_for("window.looks >= 2")  # and they do not try again
-    page.get_by_label("Person's id").fill("anna")
-    page.get_by_label("Files", exact=True).check()
-    page.get_by_label("Photos: JPEG").set_input_files(people[WHO][0])
-    press(page, "Verify")
+    tab.name_person("anna")
+    tab.choose_files(people[WHO][0])
+    tab.press("Verify")
     alert = page.get_by_role("alert")
     expect(alert).to_contain_text("is not the one that was asked for")
     expect(alert).to_contain_text("private_mode")

@@ -3,11 +3,16 @@
 import pytest
 from playwright.sync_api import Route, expect
 
-from tests.web.answers import refused
 from tests.web.conftest import OpenTab
 from tests.web.served import Served
 
 pytestmark = pytest.mark.long
+
+BLOCKED = """
+Object.defineProperty(window, "sessionStorage", {
+  get() { throw new DOMException("blocked", "SecurityError"); },
+});
+"""
 
 
 def test_a_reload_keeps_the_session_unless_that_is_not_wanted(
@@ -25,7 +30,7 @@ def test_a_reload_keeps_the_session_unless_that_is_not_wanted(
     page.reload()
     expect(page.get_by_role("heading", level=1, name="People")).to_be_visible()
     assert page.evaluate("localStorage.length") == 0
-    page.get_by_role("button", name="Sign out").click()
+    tab.press("Sign out")
     expect(page.get_by_role("heading", level=1, name="Sign in")).to_be_focused()
     assert page.evaluate("sessionStorage.length + localStorage.length") == 0
     assert demo.token not in page.content()
@@ -38,58 +43,48 @@ def test_what_a_key_may_not_do_is_switched_off_with_the_reason(
 ) -> None:
     tab = open_tab(demo, sign_in=demo.key("verify"))
     page = tab.page
-    expect(page.get_by_label("Person's id")).to_be_enabled()
-    for view in ("Enroll", "People"):
-        tab.open(view)
-        expect(
-            page.get_by_role("note").filter(has_text="does not have the right “enroll”")
-        ).to_be_visible()
+    tab.name_person("found-")
+    tab.choose_drawn("person-2", 1)
+    expect(page.locator("datalist")).to_have_count(0)
+    assert not [url for url in tab.requests if "/v1/subjects" in url]
     tab.open("Enroll")
-    expect(page.get_by_label("Person's id")).to_be_disabled()
+    expect(page.get_by_label("Person’s id")).to_be_disabled()
     expect(page.get_by_role("button", name="Enroll", exact=True)).to_be_disabled()
-    erase = page.get_by_role("note").filter(has_text="does not have the right “erase”")
     tab.open("People")
-    expect(erase).to_be_visible()
+    for right in ("enroll", "erase"):
+        note = page.get_by_role("note").filter(has_text=f"does not have the right “{right}”")
+        expect(note).to_be_visible()
     tab.open("Service")
-    expect(page.get_by_role("list", name="Rights")).to_contain_text("verify: may verify people")
-    expect(page.get_by_role("list", name="Rights")).to_contain_text("erase: may not erase")
+    expect(page.get_by_role("list", name="Rights")).to_contain_text("verify may verify people")
+    expect(page.get_by_role("list", name="Rights")).to_contain_text("erase may not erase")
 
 
-def test_a_key_that_is_revoked_meanwhile_signs_out(open_tab: OpenTab, demo: Served) -> None:
-    tab = open_tab(demo)
-    answer = refused(401, "unauthorized", "send a valid API key")
-    tab.page.route("**/v1/subjects?*", lambda route: route.fulfill(**answer))
-    tab.page.get_by_role("link", name="People").click()
+def test_a_browser_without_storage_and_a_view_that_is_none(open_tab: OpenTab, demo: Served) -> None:
+    tab = open_tab(demo, sign_in=None)
+    tab.page.add_init_script(BLOCKED)
+    tab.sign_in(demo.token, keep=True)
+    for name in ("constructor", "toString", "__proto__", ""):
+        tab.page.evaluate("name => { location.hash = `#/${name}`; }", name)
+        expect(tab.page.get_by_role("heading", level=1, name="Verify")).to_be_visible()
+    tab.press("Sign out")
     expect(tab.page.get_by_role("heading", level=1, name="Sign in")).to_be_visible()
-    expect(tab.page.get_by_role("alert")).to_contain_text("unauthorized")
 
 
-def test_a_service_that_is_away_is_said(open_tab: OpenTab, demo: Served) -> None:
-    tab = open_tab(demo)
-    tab.page.route("**/v1/subjects?*", lambda route: route.abort())
-    tab.open("People")
-    alert = tab.page.get_by_role("alert")
-    expect(alert).to_contain_text("The service does not respond.")
-    expect(alert).to_contain_text("unreachable")
-    assert tab.complaints == ["Failed to load resource: net::ERR_FAILED"]
-    tab.complaints.clear()
+def test_below_a_prefix_the_page_works_alike(open_tab: OpenTab, demo: Served) -> None:
+    """As a proxy serves it: the page asks for nothing outside the prefix."""
+    tab = open_tab(demo, sign_in=None)
 
+    def passed_on(route: Route) -> None:
+        route.fulfill(response=route.fetch(url=route.request.url.replace("/face", "", 1)))
 
-def test_guidance_waits_as_long_as_it_is_told(open_tab: OpenTab, demo: Served) -> None:
-    tab = open_tab(demo)
-    asked: list[str] = []
-
-    def too_many(route: Route) -> None:
-        asked.append("check")
-        route.fulfill(**refused(429, "rate_limited", "too many requests", wait=30))
-
-    tab.page.route("**/v1/photos/check", too_many)
-    tab.page.get_by_label("Camera", exact=True).check()
-    tab.page.get_by_role("button", name="Start camera").click()
-    tab.guided("Guidance is paused: too many requests.")
-    tab.page.wait_for_timeout(2500)
-    assert asked == ["check"]
-    expect(tab.page.get_by_role("button", name="Take 3 photos")).to_be_enabled()
+    tab.page.route("**/face/**", passed_on)
+    tab.url += "face/"
+    tab.sign_in(demo.token)
+    tab.choose_drawn("person-2", 1)
+    tab.open("Service")
+    expect(tab.page.get_by_text("Database and model are up")).to_be_visible()
+    expect(tab.page.get_by_text("3 photos, which are not kept")).to_be_visible()
+    assert {url for url in tab.requests if not url.startswith(("blob:", tab.url))} == set()
 
 
 def test_a_request_elsewhere_would_be_seen(open_tab: OpenTab, demo: Served) -> None:

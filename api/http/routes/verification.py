@@ -93,6 +93,7 @@ async def verify(call: Verifies, subject: SubjectDep) -> VerifyAnswer:
         contract_id=decision.contract_id,
         calibration_id=decision.calibration_id,
         distance=decision.distance if call.sees_scores else None,
+        distance_threshold=decision.distance_threshold if call.sees_scores else None,
         liveness_failure=decision.liveness_failure if call.sees_scores else None,
         advice=decision.advice,
     )

@@ -64,8 +64,10 @@ def test_everything_that_the_page_names_is_served(client: Client) -> None:
         kind = {".js": "text/javascript; charset=utf-8", ".css": "text/css; charset=utf-8",
                 ".svg": "image/svg+xml"}.get(Path(path).suffix)  # fmt: skip
         assert kind is None or answer.headers["content-type"] == kind
-        named = set(re.findall(r'(?:href|src)="(/[^"]*)"', answer.text) if path == "/" else ())
-        imported = re.findall(r'(?:from |import\()"\./([^"]+)"', answer.text)
+        # Relative, so that they are right below a proxy's prefix too.
+        links = re.findall(r'(?:href|src)="([^"#]+)"', answer.text) if path == "/" else ()
+        named = {f"/{link}" for link in links}
+        imported = re.findall(r'(?:from |import\()"\./([^"/]+)"', answer.text)
         named |= {f"/assets/{name}" for name in imported}
         waiting += sorted(named - seen)
     assert seen == {"/", "/docs"} | {

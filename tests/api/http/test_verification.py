@@ -118,7 +118,7 @@ def test_distance_only_with_scores_and_enroll(client: Client, deployment: Deploy
     for rights, told in (
         (("scores",), set()),
         (("enroll",), set()),
-        (("scores", "enroll"), {"distance"}),
+        (("scores", "enroll"), {"distance", "distance_threshold"}),
     ):
         token = deployment.key("verify", *rights)
         body = assert_answer(
@@ -126,6 +126,7 @@ def test_distance_only_with_scores_and_enroll(client: Client, deployment: Deploy
         )
         assert set(body) == PRODUCT_KEYS | told
     assert 0 < body["distance"] <= 2
+    assert (body["distance"] <= body["distance_threshold"]) == (body["decision"] == "accept")
 
 
 def test_embeddings_and_lifted_probes(client: Client, sender: str, deployment: Deployment) -> None:

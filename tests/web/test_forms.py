@@ -1,0 +1,282 @@
+"""Forms: whom they are about, photos that are dropped, and what comes late."""
+
+import contextlib
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from playwright.sync_api import Error, Page, expect
+
+from tests.web.answers import PendingRequests, refused
+from tests.web.conftest import OpenTab
+from tests.web.served import Served
+from tests.web.walk import TO_FILE, enroll
+
+pytestmark = pytest.mark.long
+
+NAMES = ("found-ada", "found-ben", "found-ben-2")
+DECISION = {
+    "decision": "accept", "reason": "match", "level": "fmr-1e-2", "fmr": 0, "contract_id": "0" * 64,
+    "calibration_id": "0" * 64, "request_id": "0" * 32,
+}  # fmt: skip
+DROP = """
+async ([selector, url]) => {
+  const data = new DataTransfer();
+  const add = (parts, name, type) => data.items.add(new File(parts, name, { type }));
+  if (url === "text") data.setData("text/plain", "dragged");
+  else if (url === "key file") add(["key"], "key.txt", "text/plain");
+  else add([await (await fetch(url)).blob()], "dropped.png", "image/png");
+  const target = document.querySelector(selector);
+  const options = { bubbles: true, cancelable: true, dataTransfer: data };
+  const over = !target.dispatchEvent(new DragEvent("dragover", options));
+  const lit = document.querySelector("form.dropping") !== null;
+  return [over, lit, !target.dispatchEvent(new DragEvent("drop", options))];
+}
+"""
+"""Drop a picture, a key file or text on an element; whether the page takes it over from the browser
+while it is above, lights up its form, and takes it over when it is dropped."""
+
+
+@pytest.fixture
+def enrolled(demo: Served) -> Iterator[None]:
+    """Three people whose ids begin alike."""
+    for name in NAMES:
+        enroll(demo, name, "person-2")
+    yield
+    with demo.client() as client:
+        for name in NAMES:
+            assert client.delete(f"/v1/subjects/{name}").is_success
+
+
+@pytest.mark.usefixtures("enrolled")
+def test_people_whose_ids_begin_so_are_suggested(open_tab: OpenTab, demo: Served) -> None:
+    tab = open_tab(demo)
+    page = tab.page
+    field = page.get_by_label("Person’s id")
+    suggested = page.locator(f"datalist#{field.get_attribute('list')} option")
+    field.press_sequentially("found-")
+    expect(suggested).to_have_count(3)
+    expect(suggested.last).to_have_text(re.compile("^1 photo, "))
+    expect(page.get_by_text("3 people found.")).to_be_visible()
+    # One that is enrolled is enough said, though another id begins with it.
+    field.fill("found-ben")
+    expect(page.get_by_text("✓ Enrolled: 1 photo")).to_be_visible()
+    # A search that fails says nothing: the form does, when it is sent.
+    page.route("**/v1/subjects?*", lambda route: route.abort())
+    with page.expect_event("requestfailed"):
+        field.fill("found-a")
+    expect(page.get_by_text("✓ Enrolled")).to_have_count(0)
+    expect(suggested).to_have_count(0)
+    tab.open("People")
+    tab.is_refused("The service does not respond.", "unreachable")
+    assert set(tab.complaints) == {"Failed to load resource: net::ERR_FAILED"}
+    tab.complaints.clear()
+
+
+@pytest.mark.usefixtures("enrolled")
+def test_people_come_page_by_page(open_tab: OpenTab, demo: Served) -> None:
+    tab = open_tab(demo)
+    page = tab.page
+    people = page.locator("li.person")
+    page.route(
+        "**/v1/subjects?*",
+        lambda route: route.continue_(url=route.request.url.replace("limit=100", "limit=2")),
+    )
+    tab.open("People")
+    expect(people).to_have_count(2)
+    expect(page.get_by_text("2 people shown, with more to come.")).to_be_visible()
+    tab.press("Show more")
+    expect(people).to_have_count(4)
+    expect(page.get_by_role("button", name="Show more")).to_be_hidden()
+    expect(people.nth(2).get_by_role("link").first).to_be_focused()
+
+
+def test_an_enrollment_is_replaced_only_where_the_visitor_says_so(
+    open_tab: OpenTab, demo: Served
+) -> None:
+    tab = open_tab(demo)
+    page = tab.page
+    verdict = page.locator(".verdict")
+    dialog = page.get_by_role("dialog", name="Replace visitor’s enrollment?")
+    button = page.get_by_role("button", name="Enroll", exact=True)
+
+    def template_id() -> str:
+        with demo.client() as client:
+            return client.get("/v1/subjects/visitor").json()["template_id"]
+
+    tab.open("Enroll")
+    tab.name_person("visitor")
+    tab.choose_drawn("person-1", 1)
+    button.click()
+    expect(verdict).to_contain_text("Earlier enrollmentnone")
+    first = template_id()
+    tab.choose_drawn("person-1", 2)
+    button.click()
+    expect(dialog.get_by_role("button", name="Keep")).to_be_focused()
+    page.keyboard.press("Escape")
+    expect(dialog).to_have_count(0)
+    expect(button).to_be_focused()
+    expect(page.locator(".tray li")).to_have_count(1)
+    assert template_id() == first
+
+    # What somebody else enrolled while the question stood is not replaced by the answer.
+    button.click()
+    expect(dialog).to_be_visible()
+    with demo.client() as client:
+        client.delete("/v1/subjects/visitor")
+    enroll(demo, "visitor", "person-1")
+    meanwhile = template_id()
+    dialog.get_by_role("button", name="Replace").click()
+    tab.is_refused("enrollment_conflict")
+    assert template_id() == meanwhile
+    button.click()
+    dialog.get_by_role("button", name="Replace").click()
+    expect(verdict).to_contain_text("Earlier enrollmentreplaced")
+    assert template_id() != meanwhile
+    with demo.client() as client:
+        assert client.delete("/v1/subjects/visitor").is_success
+
+
+def test_photos_are_dropped_on_the_form(open_tab: OpenTab, demo: Served) -> None:
+    tab = open_tab(demo)
+    page = tab.page
+    tab.open("Enroll")
+    url = "/demo/people/person-1/0.png"
+    for count in (1, 2):
+        assert page.evaluate(DROP, ["form", url]) == [True, True, True]
+        tab.good(count)
+    expect(page.locator("form.dropping")).to_have_count(0)
+    # What misses the form is taken by nobody, and does not replace the page.
+    assert page.evaluate(DROP, ["h1", url]) == [True, False, True]
+    assert page.evaluate(DROP, ["h1", "text"]) == [False, False, False]
+    # What is no picture is not sent anywhere; the place for the key file takes it.
+    assert page.evaluate(DROP, ["form", "key file"]) == [True, True, True]
+    expect(page.get_by_text("No picture: key.txt.")).to_be_visible()
+    tab.lock_by(TO_FILE)
+    assert page.evaluate(DROP, ["details .drop", "key file"]) == [True, False, True]
+    expect(page.locator("details .drop")).to_contain_text("key.txt")
+    expect(page.locator(".tray li")).to_have_count(2)
+    # Where the form is switched off, it takes nothing.
+    tab.sign_in(demo.key("verify"))
+    tab.open("Enroll")
+    assert page.evaluate(DROP, ["form", url])[1] is False
+
+
+def test_a_late_decision_names_whom_it_is_about(open_tab: OpenTab, demo: Served) -> None:
+    tab = open_tab(demo)
+    page = tab.page
+    subject = page.get_by_label("Person’s id")
+    pending = PendingRequests(page, "**/verify")
+    for heard in (False, True):
+        pending.routes.clear()
+        subject.fill("alice")
+        tab.choose_drawn("person-2", 1)
+        tab.press("Verify")
+        waiting = pending.wait()
+        expect(subject).to_be_disabled()
+        expect(page.get_by_role("button", name="Remove photo")).to_be_disabled()
+        subject.evaluate(
+            "(input, heard) => { input.value = 'bob'; input.form.requestSubmit();"
+            " if (heard) input.dispatchEvent(new Event('input')); }",
+            heard,
+        )
+        waiting.fulfill(json=DECISION)
+        expect(subject).to_be_enabled()
+        if heard:
+            # Something else is asked by now: the answer is not shown at all.
+            expect(page.locator(".verdict")).to_have_count(0)
+        else:
+            expect(page.locator(".verdict")).to_contain_text("alice, at level fmr-1e-2")
+            expect(page.locator(".verdict")).to_contain_text("0 % (none seen)")
+        assert len(pending.routes) == 1
+
+
+def test_a_late_enrollment_is_of_the_photos_that_were_sent(open_tab: OpenTab, demo: Served) -> None:
+    tab = open_tab(demo)
+    page = tab.page
+    tab.open("Enroll")
+    subject = page.get_by_label("Person’s id")
+    third = PendingRequests(page, "**/demo/people/person-1/2.png")
+    enrollment = PendingRequests(page, "**/enrollment")
+
+    def send(name: str) -> tuple[Any, Any]:
+        """Send two photos while a third is on its way; then the field says somebody else."""
+        third.routes.clear()
+        enrollment.routes.clear()
+        tab.name_person(name)
+        page.get_by_role("button", name="Choose photo 3 of person-1").click()
+        late = third.wait()
+        tab.press("Enroll")
+        waiting = enrollment.wait()
+        late.continue_()
+        expect(page.locator(".tray li")).to_have_count(3)
+        tab.good(3)
+        subject.evaluate("(input) => { input.value = 'bob'; input.form.requestSubmit(); }")
+        return waiting, late
+
+    for shot in (1, 2):
+        tab.choose_drawn("person-1", shot)
+    third.routes.clear()
+    waiting, _ = send("alice")
+    # The first photo was sent, the third one was not.
+    waiting.fulfill(**refused(422, "inconsistent_images", "they differ", photos=[0, 2]))
+    expect(page.locator(".tray .seen[data-state=bad]")).to_have_count(1)
+    assert len(enrollment.routes) == 1
+    tab.press("Remove photo from person-1, photo 3")
+    page.get_by_label("Others are in the picture").evaluate("(each) => each.click()")
+    tab.good(2)
+    waiting, _ = send("alice")
+    images = [{"index": index, "status": "used", "quality": {}} for index in range(2)]
+    waiting.fulfill(
+        status=201,
+        json={"template_id": "0" * 32, "contract_id": "0" * 64, "replaced": False,
+              "images": images, "request_id": "0" * 32},
+    )  # fmt: skip
+    expect(page.locator(".verdict")).to_contain_text("Personalice")
+    expect(page.locator(".verdict")).to_contain_text("Photos used2")
+    # It came too late to be sent, and is there still.
+    expect(page.locator(".tray li")).to_have_count(1)
+    expect(page.get_by_label("Remove photo from person-1, photo 3")).to_be_visible()
+
+
+def test_a_late_refusal_of_another_key_does_not_sign_out(open_tab: OpenTab, demo: Served) -> None:
+    tab = open_tab(demo)
+    page = tab.page
+    pending = PendingRequests(page, "**/v1/subjects?*")
+    page.get_by_role("link", name="People").click()
+    waiting = pending.wait()
+    tab.press("Sign out")
+    page.get_by_label("API key").fill(demo.token)
+    tab.press("Sign in")
+    expect(page.get_by_role("button", name="Sign out")).to_be_visible()
+    # It was ended with the key it was made with, so it may be too late to answer it.
+    with contextlib.suppress(Error):
+        waiting.fulfill(**refused(401, "unauthorized", "send a valid API key"))
+        page.wait_for_timeout(200)
+    expect(page.get_by_role("button", name="Sign out")).to_be_visible()
+    tab.complaints[:] = [each for each in tab.complaints if "ERR_ABORTED" not in each]
+
+
+@pytest.mark.usefixtures("enrolled")
+def test_every_receipt_stays_and_no_failure_is_lost(open_tab: OpenTab, demo: Served) -> None:
+    tab = open_tab(demo)
+    page = tab.page
+    tab.open("People")
+    pending = PendingRequests(page, "**/v1/subjects/*")
+
+    def erase(page: Page, name: str) -> Any:
+        pending.routes.clear()
+        tab.press(f"Erase {name}")
+        page.get_by_role("dialog").get_by_role("button", name="Erase", exact=True).click()
+        return pending.wait()
+
+    for name in NAMES[:2]:
+        claims = {"erased_at": "2026-01-31T12:00:00Z", "erased": [], "subject": "0" * 64,
+                  "signing_key": "0f3a", "receipt_id": name}  # fmt: skip
+        json = {"receipt": {}, "claims": claims, "request_id": "0" * 32}
+        erase(page, name).fulfill(json=json)
+        expect(page.locator(".verdict").first).to_contain_text(f"Erased {name}")
+    expect(page.get_by_role("button", name="Download receipt")).to_have_count(2)
+    erase(page, NAMES[2]).fulfill(**refused(429, "rate_limited", "too many requests"))
+    tab.is_refused("rate_limited")
