@@ -264,3 +264,27 @@ def test_photos_are_decoded_one_at_a_time(open_tab: OpenTab, demo: Served) -> No
     expect(page.locator(".refused")).to_have_text(
         "None of 3 photos taken. The browser could not take a photo."
     )
+
+
+def test_the_photo_of_three_that_shows_somebody_else_is_named(
+    open_tab: OpenTab, real: Served, people: dict[str, list[Path]]
+) -> None:
+    tab = open_tab(real)
+    page = tab.page
+    own, other = people[WHO], people[OTHER]
+    with real.client() as client:
+        enrolled = [("images", ("0.jpg", own[0].read_bytes()))]
+        assert client.put("/v1/subjects/two-people/enrollment", files=enrolled).is_success
+    tab.name_person("two-people")
+    tab.choose_files(own[0], other[0], own[1])
+    tab.press("Verify")
+    tab.is_refused("Photo 2 does not look like the person on photos 1 and 3")
+    bad = page.locator(".tray .seen[data-state=bad]")
+    expect(bad).to_have_count(1)
+    expect(page.locator(".tray li").nth(1)).to_contain_text("Does not look like")
+    # What is chosen next replaces them.
+    tab.choose_files(*own[:5], other[0])
+    expect(page.locator(".tray li")).to_have_count(5)
+    expect(page.get_by_text("No more than 5 photos: these are the first.")).to_be_visible()
+    with real.client() as client:
+        assert client.delete("/v1/subjects/two-people").is_success

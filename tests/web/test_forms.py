@@ -3,11 +3,13 @@
 import contextlib
 import re
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 from playwright.sync_api import Error, Page, expect
 
+from tests.api.cli.conftest import run
 from tests.web.answers import PendingRequests, refused
 from tests.web.conftest import OpenTab
 from tests.web.served import Served
@@ -136,6 +138,29 @@ def test_an_enrollment_is_replaced_only_where_the_visitor_says_so(
     assert template_id() != meanwhile
     with demo.client() as client:
         assert client.delete("/v1/subjects/visitor").is_success
+
+
+def test_a_receipt_is_good_for_the_contract_beside_it(
+    open_tab: OpenTab, demo: Served, tmp_path: Path
+) -> None:
+    enroll(demo, "erased", "person-1")
+    tab = open_tab(demo)
+    page = tab.page
+    tab.open("Service")
+    with page.expect_download() as contract:
+        tab.press("Download contract")
+    contract.value.save_as(tmp_path / "contract.json")
+    tab.open("People")
+    tab.press("Erase erased")
+    page.get_by_role("dialog").get_by_role("button", name="Erase", exact=True).click()
+    with page.expect_download() as receipt:
+        tab.press("Download receipt")
+    receipt.value.save_as(tmp_path / "receipt.json")
+    checked = run(
+        "keys", "verify-receipt", tmp_path / "receipt.json",
+        "--public-key", tmp_path / "contract.json",
+    )  # fmt: skip
+    assert checked.status == 0, checked.stderr
 
 
 def test_photos_are_dropped_on_the_form(open_tab: OpenTab, demo: Served) -> None:

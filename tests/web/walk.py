@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import pytest
 from playwright.sync_api import expect
 
 from tests.web.answers import PendingRequests, refused
@@ -230,12 +231,16 @@ def walk_real(
         tab.good(3)
         tab.choose_files(own[1], other[0])
         tab.good(5)
+        assert_boxed(tab, real, own[1])
         tab.press("Enroll")
         tab.is_refused("inconsistent_images")
+        expect(page.locator(".tray li").last).to_contain_text("Does not look like")
         yield "real-enroll-refused"
         tab.press(f"Remove photo from {other[0].name}")
         tab.press("Enroll")
-        expect(page.locator(".verdict")).to_contain_text("Enrolled")
+        expect(page.get_by_role("list", name="Photos used").locator("img")).to_have_count(4)
+        expect(page.locator(".verdict .found:not([hidden])")).to_have_count(4)
+        expect(page.locator(".verdict")).to_be_focused()
         yield "real-enrolled"
         for shown, decision in ((other, "reject"), (own, "accept")):
             tab.open("People")
@@ -245,6 +250,7 @@ def walk_real(
             tab.guided("Good: one face")
             tab.press("Verify")
             tab.is_decided(decision)
+            expect(page.locator(".verdict")).to_contain_text("1 % (1 in 100)")
             tab.good(3)
             yield f"real-{decision}"
         tab.open("Service")
@@ -362,6 +368,19 @@ def enroll(demo: Served, subject: str, person: str, shots: int = 1) -> None:
     photos = [("images", (f"{n}.png", (folder / f"{n}.png").read_bytes())) for n in range(shots)]
     with demo.client() as client:
         assert client.put(f"/v1/subjects/{subject}/enrollment", files=photos).is_success
+
+
+def assert_boxed(tab: BrowserTab, real: Served, photo: Path) -> None:
+    """The fourth photo has the box where the service found the face."""
+    expect(tab.page.locator(".tray .found:not([hidden])")).to_have_count(5)
+    with real.client() as client:
+        box = client.post("/v1/photos/check", files={"image": photo.read_bytes()}).json()["box"]
+    drawn = tab.page.locator(".tray .found").nth(3)
+    x, y, width, height = (
+        float(drawn.get_attribute(name) or "nan") for name in ("x", "y", "width", "height")
+    )
+    assert [x, y, x + width, y + height] == pytest.approx(box)
+    assert tab.page.locator(".tray .overlay").nth(3).get_attribute("viewBox") == "0 0 250 250"
 
 
 def without_a_face() -> bytes:
