@@ -91,6 +91,7 @@ class Decision(Answer):
     contract_id: str
     calibration_id: str
     distance: float | None = None
+    distance_threshold: float | None = None
     liveness: str = "not_checked"  # as a service that checks none would say
     liveness_failure: str | None = None
     advice: str | None = None
