@@ -6,7 +6,7 @@ import { call, form, session, subjectPath } from "./service.js";
 const ENOUGH = 3;
 const STEPS = [
   "The service finds the face in each photo, and says at once whether the photo will do.",
-  "The faces become one embedding, which is hidden in a set that holds decoys as well.",
+  "The faces become one embedding, and that becomes a set which holds decoys as well.",
   "Only that set is stored, encrypted. Photos and embedding are forgotten.",
 ];
 

@@ -61,7 +61,7 @@ export function photoForm(id, view) {
     say(starts ? "Start camera" : moving() ? "Start head movements" : view.verb);
     send.disabled = !(camera || moving() || picker?.ready());
     send.formNoValidate = starts;
-    progress.replaceChildren(...(view.progress?.(picker?.chosen().length ?? 0, subject.person()) ?? []));
+    if (picker && view.progress) progress.replaceChildren(...view.progress(picker.chosen().length, subject.person()));
   }
 
   async function submit(event) {

@@ -16,7 +16,7 @@ const LOADING = "Loading the model into this browser, which keeps it for the nex
 // Of an enrollment.
 export const STEPS = [
   "This browser finds the face in each photo and says at once whether the photo will do.",
-  "The model runs here: the faces become one embedding, which is hidden in a set that holds decoys as well.",
+  "The model runs here: the faces become one embedding, and that becomes a set which holds decoys as well.",
   "Only that set is sent, and stored, encrypted. Photos and embedding never leave this browser.",
 ];
 
