@@ -32,6 +32,7 @@ from api.http.openapi import ERRORS, DescribedApi, allowed_methods, describe, op
 from api.http.routes import (
     audit_log,
     challenges,
+    comparison,
     contract,
     enrollment,
     health,
@@ -69,6 +70,7 @@ API = (
     pack,
     tokens,
     enrollment,
+    comparison,
     photo_check,
     subjects,
     challenges,

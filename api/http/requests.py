@@ -117,10 +117,10 @@ def _files(value: Any) -> Sequence[bytes]:
     return value
 
 
-def _photos(most: int) -> Any:
+def _photos(most: int, *, least: int = 1) -> Any:
     """The schema of files of one field."""
     file = {"type": "string", "format": "binary"}
-    return WithJsonSchema({"type": "array", "items": file, "minItems": 1, "maxItems": most})
+    return WithJsonSchema({"type": "array", "items": file, "minItems": least, "maxItems": most})
 
 
 Text = Annotated[str, Field(min_length=1, max_length=64), AfterValidator(_printable)]
@@ -259,6 +259,14 @@ class VerifyJson(Body):
         if sum(probe is not None for probe in probes) != 1:
             raise ValueError("send exactly one of embedding, embeddings and template, or photos")
         return self
+
+
+class CompareForm(Body):
+    """Two photos: the first stands for an enrollment, the second for the probe."""
+
+    images: Annotated[Photos, Field(min_length=2), _photos(2, least=2)]
+    level: Level | None = None
+    face: Face = FacePolicy.DOMINANT
 
 
 class PhotoCheckForm(Body):

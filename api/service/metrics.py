@@ -56,7 +56,7 @@ REQUEST_SECONDS = Histogram(
 ERRORS = Counter("veilface_errors", "Errors that were answered.", ("code",), registry=REGISTRY)
 DECISIONS = Counter(
     "veilface_decisions",
-    "Verifications that were decided.",
+    "Verifications and comparisons that were decided.",
     ("decision", "reason", "level", "probe"),
     registry=REGISTRY,
 )
@@ -143,7 +143,7 @@ def step(name: str) -> AbstractContextManager[object]:
 
 
 def count_decision(*, accepted: bool, reason: str, level: str, probe: str) -> None:
-    """Count one verification that was decided.
+    """Count one verification, or comparison, that was decided.
 
     Parameters
     ----------
@@ -151,7 +151,7 @@ def count_decision(*, accepted: bool, reason: str, level: str, probe: str) -> No
         The decision, ``match``, ``no_match`` or ``liveness``, and the security level of the
         contract that it was made at.
     probe
-        ``photo``, ``frames``, ``embedding`` or ``template``.
+        ``photo``, ``frames``, ``embedding`` or ``template``; ``comparison`` of two photos.
     """
     DECISIONS.labels("accept" if accepted else "reject", reason, level, probe).inc()
 

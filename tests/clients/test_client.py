@@ -53,6 +53,8 @@ def test_a_person_from_enrollment_to_receipt(service: Running, token: str, tmp_p
             client.verify("anna", [photo(1, 3), photo(2, 0), photo(1, 4)])
         with pytest.raises(InvalidRequest, match="at most 5 photos"):
             client.verify("anna", [photo(1, shot) for shot in range(6)])
+        assert client.compare(photo(1), path, level="fmr-1e-2").level == "fmr-1e-2"
+        assert not client.compare(path, photo(2))
         rejected = client.verify("anna", photo(2, 0))
         assert not rejected
         assert rejected.reason == "no_match"

@@ -83,6 +83,17 @@ async def verify(call: Verifies, subject: SubjectDep) -> VerifyAnswer:
                 wipe(sent.holder_key)
 
         decision = await call.compute(work)
+    return answer_of(call, decision, probe=sent.kind)
+
+
+def answer_of(call: Call, decision: Decision, *, probe: str) -> VerifyAnswer:
+    """Return the answer, with what the caller may see; note it for the log and the metrics.
+
+    Parameters
+    ----------
+    probe
+        What metrics call the probe.
+    """
     answer = VerifyAnswer(
         **call.common,
         decision="accept" if decision.accepted else "reject",
@@ -98,9 +109,11 @@ async def verify(call: Verifies, subject: SubjectDep) -> VerifyAnswer:
         advice=decision.advice,
     )
     call.request.state.log.update(
-        security_level=level, decision=answer.decision, liveness=answer.liveness
+        security_level=decision.level, decision=answer.decision, liveness=answer.liveness
     )
-    count_decision(accepted=decision.accepted, reason=decision.reason, level=level, probe=sent.kind)
+    count_decision(
+        accepted=decision.accepted, reason=decision.reason, level=decision.level, probe=probe
+    )
     return answer
 
 

@@ -57,6 +57,17 @@ test("a rejection is a decision that was not accepted", (t) =>
     assert.match(body, /name="level"\r\n\r\nfmr-1e-3\r\n/);
   }));
 
+test("two photos are compared, and asked for again after a lost answer", (t) =>
+  answering(t, [error(503, "store_unavailable"), decision], async (client, requests) => {
+    const { accepted } = await client.compare(...PHOTOS, ...PHOTOS, { level: "fmr-1e-3" });
+    assert.equal(accepted, false);
+    assert.equal(requests.length, 2);
+    const [{ method, url, body }] = requests;
+    assert.deepEqual([method, url], ["POST", "/v1/compare"]);
+    assert.equal(body.match(/name="images"; filename="photo"/g).length, 2);
+    assert.match(body, /name="level"\r\n\r\nfmr-1e-3\r\n/);
+  }));
+
 test("what an enrollment may replace is a header", (t) =>
   answering(t, [{ body: { request_id: "r1", template_id: "t", replaced: false } }], async (client, requests) => {
     const holderKey = newHolderKey();

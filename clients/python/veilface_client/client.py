@@ -282,6 +282,7 @@ class Client(_Session):
     enroll = _blocking(PhotoFlows.enroll)
     challenge = _blocking(PhotoFlows.challenge)
     verify = _blocking(PhotoFlows.verify)
+    compare = _blocking(PhotoFlows.compare)
 
 
 class PrivateClient(_Session):
@@ -339,6 +340,7 @@ class AsyncClient(_AsyncSession):
     enroll = _asynchronous(PhotoFlows.enroll)
     challenge = _asynchronous(PhotoFlows.challenge)
     verify = _asynchronous(PhotoFlows.verify)
+    compare = _asynchronous(PhotoFlows.compare)
 
 
 class AsyncPrivateClient(_AsyncSession):

@@ -303,6 +303,20 @@ class PhotoFlows(Flows):
         files = yield lambda: _files("image", photos)
         return (yield from self._verify(subject, files=files, data=fields))
 
+    def compare(
+        self, first: Photo, second: Photo, *, level: str | None = None, face: Face | None = None
+    ) -> Flow[results.Decision]:
+        """Check whether two photos show one person; nothing is stored. Right: ``verify``.
+
+        The `first` stands for an enrollment, and the `second` is decided as by :meth:`verify`. No
+        attempt is counted on anybody, so a lost answer is asked for again.
+        """
+        files = yield lambda: _files("images", [first, second])
+        fields = _present(level=level, face=face)
+        return (
+            yield from self._send(results.Decision, "POST", "/v1/compare", files=files, data=fields)
+        )
+
 
 class PrivateFlows(Flows):
     """The calls of a client that never sends a face: it lifts here, and sends templates."""

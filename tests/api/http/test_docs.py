@@ -19,6 +19,7 @@ DOCS = Path(__file__).resolve().parents[3] / "docs"
 PRODUCT_CALLS = {
     ("PUT", "/v1/subjects/{subject_id}/enrollment"),
     ("POST", "/v1/subjects/{subject_id}/verify"),
+    ("POST", "/v1/compare"),
     ("GET", "/v1/subjects"),
     ("GET", "/v1/subjects/{subject_id}"),
     ("DELETE", "/v1/subjects/{subject_id}"),
@@ -117,6 +118,7 @@ def test_bodies_are_documented_with_all_their_fields(document: dict[str, Any]) -
             form: {"image", "images", "challenge_id", "level", "face", "holder_key"},
             json_: {"embedding", "embeddings", "template", "level", "holder_key"},
         },
+        "compare": {form: {"images", "level", "face"}},
         "checkPhoto": {form: {"image", "face"}},
         "createChallenge": {json_: {"subject_id"}},
         "createToken": {json_: {"subject_id", "action", "level", "lifetime_s", "replace"}},

@@ -167,10 +167,18 @@ export class Session {
     });
   }
 
-  /** Verify photos or a template; an answer that is neither accept nor reject is no decision. */
-  protected async postProbe(subject: string, body: FormData | object): Promise<Decision> {
-    const path = subjectPath(subject, "/verify");
-    const answer = await this.sender.json<Decision>({ method: "POST", path, body, onlyOnce: true });
+  /** Verify photos or a template. */
+  protected postProbe(subject: string, body: FormData | object): Promise<Decision> {
+    return this.decide({ path: subjectPath(subject, "/verify"), body, onlyOnce: true });
+  }
+
+  /** Ask for a decision; an answer that is neither accept nor reject is none. */
+  protected async decide(sent: {
+    path: string;
+    body: FormData | object;
+    onlyOnce: boolean;
+  }): Promise<Decision> {
+    const answer = await this.sender.json<Decision>({ method: "POST", ...sent });
     if (answer.decision !== "accept" && answer.decision !== "reject") {
       throw new UnexpectedAnswer("the answer is no decision");
     }
@@ -214,6 +222,21 @@ export class Client extends Session {
     const { level, face, holderKey, challenge } = options;
     const more = { level, face, challenge_id: challenge?.challenge_id, ...keyField(holderKey) };
     return this.postProbe(subject, form("image", photos, more));
+  }
+
+  /**
+   * Check whether two photos show one person; nothing is stored. Right: `verify`.
+   *
+   * The first stands for an enrollment, and the second is decided as by `verify`. No attempt is
+   * counted on anybody, so a lost answer is asked for again.
+   */
+  async compare(
+    first: Blob,
+    second: Blob,
+    options: { readonly level?: string; readonly face?: FacePolicy } = {},
+  ): Promise<Decision> {
+    const body = form("images", [first, second], { ...options });
+    return this.decide({ path: "/v1/compare", body, onlyOnce: false });
   }
 }
 

@@ -1,0 +1,90 @@
+"""Comparison: do two photos show one person? Nobody is enrolled, and nothing is kept.
+
+The first photo is lifted to a private template in memory, as an enrollment of one photo would be.
+The second is decided against it as a verification, by the same code and the same threshold.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from fastapi import APIRouter
+
+from api.http.auth import Call, Verifies
+from api.http.bodies import read_form
+from api.http.openapi import body_of
+from api.http.requests import CompareForm
+from api.http.routes.verification import answer_of
+from api.http.schemas import VerifyAnswer
+from api.service.metrics import step
+from models.errors import PhotoRejected
+from templates.store.audit_log import Entry
+from verify import Decision, probe_of_photos
+
+router = APIRouter(prefix="/v1/compare", tags=["Enroll and verify"])
+
+
+@router.post(
+    "",
+    openapi_extra=body_of(form=CompareForm),
+    summary="Do two photos show one person?",
+)
+async def compare(call: Verifies) -> VerifyAnswer:
+    """Right: `verify`. The first photo stands for an enrollment, and the second for the probe.
+
+    The first is lifted to a template in memory, and the second is decided against it as by a
+    verification, at a level of the contract. Nothing is stored, nobody is enrolled, and no attempt
+    is counted on anybody; the audit log has a line without a subject.
+
+    The deployment's liveness policy holds for the second photo. A challenge cannot be answered
+    here, so the call is `forbidden` where the policy asks for one. The distance is returned only to
+    keys with `scores` and `enroll`.
+    """
+    runtime = call.runtime
+    async with call.place():
+        runtime.required_pack()
+        with step("body"):
+            sent = await read_form(
+                call.request, runtime.settings, CompareForm, photos="images", most=2
+            )
+        level = runtime.levels.in_force(sent.level, lowest_of_key=call.key.lowest_level)
+        runtime.liveness.require(photos=True, challenge=False)
+        decision = await call.compute(lambda: _decide(call, sent, level))
+    return answer_of(call, decision, probe="comparison")
+
+
+def _decide(call: Call, sent: CompareForm, level: str) -> Decision:
+    """Enroll the first photo in memory, decide the second by it, and write the audit log's line."""
+    runtime, pack = call.runtime, call.runtime.required_pack()
+    passive, epoch = runtime.liveness.policy.passive, runtime.epoch(call.tenant)
+    first, second = sent.images
+    with step("photo"):
+        with _position(0):
+            template = runtime.enroller(call.tenant, epoch).from_photos(
+                pack, [first], policy=sent.face, limits=runtime.image_limits
+            )
+        with _position(1):
+            probe = probe_of_photos(
+                pack,
+                runtime.contract,
+                [second],
+                passive=passive,
+                policy=sent.face,
+                limits=runtime.image_limits,
+            )
+    with step("decide"):
+        verifier = runtime.verifier(call.tenant, epoch)
+        decision = verifier.decide_embedding(probe.embedding, template, level=level)
+    if passive:
+        decision = decision.with_liveness(probe.failure)
+    outcome = "accept" if decision.accepted else "reject"
+    call.store.audit_log.record(Entry("compare", outcome, call.by, call.tenant, detail=level))
+    return decision.with_advice(clear=probe.clear)
+
+
+@contextmanager
+def _position(index: int) -> Iterator[None]:
+    """Name a refused photo by its position in the request."""
+    try:
+        yield
+    except PhotoRejected as error:
+        raise PhotoRejected(index, error.cause, count=2) from error
