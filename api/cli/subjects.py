@@ -32,7 +32,7 @@ from templates.keys.holder_key import (
 )
 from templates.space.agreement import InconsistentImages
 from templates.store.audit_log import Entry
-from templates.store.identifiers import InvalidIdentifier
+from templates.store.identifiers import InvalidIdentifier, checked_subject_id
 from templates.store.subject_rows import Source
 from templates.store.subjects import EnrollmentConflict, Precondition
 from verify import MAX_PROBE_PHOTOS, probe_of_photos
@@ -131,6 +131,7 @@ def enroll(
     else:
         holder_key = None if holder_key_file is None else read_holder_key(holder_key_file)
     with _opened(settings, tenant) as entrance:
+        subject = checked_subject_id(subject)
         holder = None if holder_key is None else Holder(holder_key, entrance.tenant, subject)
         prepared = _prepared(entrance, photos, attributes, face, holder)
         if new_holder_key_file is not None and holder_key is not None:

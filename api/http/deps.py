@@ -19,19 +19,22 @@ async def subject_of(
         str, Path(description=f"Subject id: has {SUBJECT_ID_RULE}.", examples=["alice"])
     ],
 ) -> str:
-    """Check the subject id, and note its pseudonym for the logs.
+    """Return the subject id in NFC, and note its pseudonym for the logs.
 
     Raises
     ------
     InvalidIdentifier
         If it breaks the rule.
     """
-    call.note_subject(checked_subject_id(subject_id))
+    subject_id = checked_subject_id(subject_id)
+    call.note_subject(subject_id)
     return subject_id
 
 
 async def refuse_unknown(request: Request) -> None:
     """Refuse what the route does not read. Fields of bodies are refused where they are read.
+
+    Every route depends on it. One that is not FastAPI's, as of the page, reads no parameter.
 
     Raises
     ------
@@ -39,7 +42,8 @@ async def refuse_unknown(request: Request) -> None:
         ``validation_failed``: a query parameter that the route does not declare, that comes twice,
         or that is not ``name=value`` in UTF-8; or a body where the call takes none.
     """
-    known = [field.alias for field in request.scope["route"].dependant.query_params]
+    dependant = getattr(request.scope["route"], "dependant", None)
+    known = [] if dependant is None else [field.alias for field in dependant.query_params]
     query = request.scope["query_string"]
     try:
         pairs = parse_qsl(
@@ -56,7 +60,7 @@ async def refuse_unknown(request: Request) -> None:
         raise ApiError("validation_failed", "a query parameter comes twice")
     headers = request.headers
     sent = headers.get("content-length", "0") != "0" or "transfer-encoding" in headers
-    if sent and request.method in ("GET", "DELETE"):
+    if sent and request.method in ("GET", "HEAD", "DELETE"):
         raise ApiError("validation_failed", "this call takes no body: send it without one")
 
 

@@ -8,6 +8,7 @@ the same transaction.
 import base64
 import binascii
 import secrets
+import unicodedata
 from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 from typing import Literal, TypeVar
@@ -120,7 +121,7 @@ class SubjectToken(Sealed):
         """
         if self.action not in CALLS.get(route, ()):
             raise _another("call", f"this token is good to {self.action}, and not for this call")
-        if subject not in (None, self.subject):
+        if subject is not None and unicodedata.normalize("NFC", subject) != self.subject:
             raise _another("subject", "this token is for another subject")
 
     def level_of(self, asked: str | None) -> str | None:

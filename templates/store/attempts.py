@@ -253,7 +253,8 @@ class Attempts:
         contract_id: str | None = None,
     ) -> dict[str, Any]:
         """Parameters of the queries."""
-        pseudonym = self._context.signer.pseudonym(tenant, checked_subject_id(subject_id))
+        subject_id = checked_subject_id(subject_id)
+        pseudonym = self._context.signer.pseudonym(tenant, subject_id)
         return {
             "tenant": tenant,
             "subject_id": subject_id,

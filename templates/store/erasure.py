@@ -66,7 +66,7 @@ class Erasures:
         pseudonym. As the failed attempts go, an erasure ends a lock: a caller who may erase and
         enroll a subject may also start its count anew.
         """
-        checked_subject_id(subject_id)
+        subject_id = checked_subject_id(subject_id)
         return self._run(lambda connection: self._erase(connection, tenant, subject_id, by))
 
     def erase_if(
@@ -80,7 +80,7 @@ class Erasures:
             None where the subject does not meet it, or is not there; nothing is done then.
             Emptying SQLite's write-ahead log is left to the caller, who may erase many.
         """
-        checked_subject_id(subject_id)
+        subject_id = checked_subject_id(subject_id)
         query = (
             sa.select(SubjectRow.id)
             .join(TenantRow, TenantRow.id == SubjectRow.tenant_id)

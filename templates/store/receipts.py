@@ -12,6 +12,7 @@ import binascii
 import hashlib
 import hmac
 import json
+import unicodedata
 import uuid
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -87,9 +88,10 @@ class ReceiptSigner:
         self._secrets = secrets
 
     def pseudonym(self, tenant: str, subject_id: str) -> str:
-        """Keyed pseudonym, 64 hexadecimal digits, of one subject of one tenant."""
+        """Keyed pseudonym, 64 hexadecimal digits, of one subject of one tenant, spelled anyhow."""
         secret = self._secrets.get(SecretName.PSEUDONYM)
-        return hmac.digest(secret, encode_parts(tenant, subject_id), hashlib.sha256).hex()
+        parts = encode_parts(tenant, unicodedata.normalize("NFC", subject_id))
+        return hmac.digest(secret, parts, hashlib.sha256).hex()
 
     def public_key(self) -> bytes:
         """The 32 bytes that verify this deployment's receipts."""

@@ -152,7 +152,7 @@ class Subjects:
         A replacement gets a fresh data key, and the old key and ciphertext are removed with it:
         an old backup of one of the two rows does not help to read the other.
         """
-        checked_subject_id(subject_id)
+        subject_id = checked_subject_id(subject_id)
         checked_opaque_id(contract_id, what="contract id")
         template_id = checked_opaque_id(template_id, what="template id")
         if not 0 < len(wire) <= MAX_WIRE_BYTES:
@@ -279,9 +279,9 @@ class Subjects:
             after = open_cursor(keyring, cursor, purpose=_CURSOR_PURPOSE, tenant=tenant)
             query = query.where(SubjectRow.subject_id > after)
         if prefix:
-            # A range, which the index of the ids serves: DEL is beyond every character of an id.
+            # A range, which the index of the ids serves: no id has the last of all characters.
             first = checked_subject_prefix(prefix)
-            query = query.where(SubjectRow.subject_id.between(first, f"{first}\x7f"))
+            query = query.where(SubjectRow.subject_id.between(first, f"{first}\U0010ffff"))
         rows = self._context.database.read(lambda connection: connection.execute(query).all())
         records = tuple(read_record(row) for row in rows[:limit])
         if len(rows) <= limit:

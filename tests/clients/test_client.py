@@ -119,6 +119,9 @@ def test_an_enrollment_that_needs_its_holders_key(service: Running, token: str) 
 def test_export_and_import(service: Running, token: str) -> None:
     with Client(service.url, token) as client:
         client.enroll("carl", photo(3))
+        assert client.enroll("Zoe\u0308", photo(1)).replaced is False
+        assert client.describe("Zo\xeb").subject_id == "Zo\xeb"
+        client.erase("Zo\xeb")
         exported = client.export("carl")
         client.erase("carl")
         imported = client.import_(exported)
@@ -218,7 +221,7 @@ def test_something_else_at_the_url(service: Running, token: str) -> None:
         client.contract()
 
 
-@pytest.mark.parametrize("subject", ["", ".", "..", "a/b", "../x", "a?b", "a b", "ä", "x" * 129])
+@pytest.mark.parametrize("subject", ["", ".", "..", "a/b", "../x", "a?b", "a b", "a%", "x" * 129])
 def test_a_subject_is_one_segment_of_the_path(subject: str) -> None:
     with Client("http://127.0.0.1:9", "vf_x") as client:
         with pytest.raises(ValueError, match="subject id"):

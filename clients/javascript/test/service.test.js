@@ -68,6 +68,12 @@ test("two photos are compared, and asked for again after a lost answer", (t) =>
     assert.match(body, /name="level"\r\n\r\nfmr-1e-3\r\n/);
   }));
 
+test("a subject id is sent in one spelling, with escapes", (t) =>
+  answering(t, [decision], async (client, requests) => {
+    await client.verify("Zoe\u0308_\u0928\u0947@example.org", PHOTOS);
+    assert.equal(requests[0].url, "/v1/subjects/Zo%C3%AB_%E0%A4%A8%E0%A5%87%40example.org/verify");
+  }));
+
 test("what an enrollment may replace is a header", (t) =>
   answering(t, [{ body: { request_id: "r1", template_id: "t", replaced: false } }], async (client, requests) => {
     const holderKey = newHolderKey();
@@ -175,7 +181,7 @@ test("keys, URLs and subjects are checked before anything is sent, and keys not 
   assert.throws(() => new Client("http://host", "vf_ secret"), (raised) => !raised.message.includes("secret"));
   const client = new Client("http://host", KEY);
   assert.ok(!inspect(client, { depth: 9 }).includes("5e5e"));
-  for (const subject of ["", "..", "a/b", "a".repeat(129)]) {
+  for (const subject of ["", "..", "a/b", "a b", "a\u200b", "a".repeat(129)]) {
     await assert.rejects(client.verify(subject, PHOTOS), RangeError);
   }
   for (const nothing of [undefined, null, 7]) {

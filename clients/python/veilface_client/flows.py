@@ -15,10 +15,12 @@ import json
 import random
 import re
 import secrets
+import unicodedata
 from collections.abc import Callable, Generator, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal, TypeVar, cast
+from urllib.parse import quote
 
 import httpx
 
@@ -444,10 +446,14 @@ def _connection_failed(error: httpx.RequestError) -> ConnectionFailed:
 
 
 def _path(subject: str, rest: str = "") -> str:
-    """Return the path of a subject; a subject id needs no escapes in it."""
-    if not re.fullmatch(r"[A-Za-z0-9._@:-]{1,128}", subject) or subject in (".", ".."):
-        raise ValueError("a subject id has 1 to 128 characters out of A-Z a-z 0-9 . _ @ : -")
-    return f"/v1/subjects/{subject}{rest}"
+    """Return the path of a subject, whose id the service reads in NFC."""
+    subject = unicodedata.normalize("NFC", subject)
+    kinds = {unicodedata.category(each)[0] for each in subject if each not in "._@:-"}
+    if not 0 < len(subject) <= 128 or subject in (".", "..") or not kinds <= set("LMN"):
+        raise ValueError(
+            "a subject id has 1 to 128 characters: letters, marks and digits, and . _ @ : -"
+        )
+    return f"/v1/subjects/{quote(subject, safe='@:')}{rest}"
 
 
 def _id(text: str, what: str) -> str:

@@ -139,3 +139,30 @@ def test_tenants_do_not_see_each_other(client: Client, deployment: Deployment) -
     if cursor is not None:
         stolen = client.get("/v1/subjects", params={"cursor": cursor}, headers=other)
         assert_error(stolen, 422, "validation_failed")
+
+
+def test_a_subject_id_of_any_script_has_one_spelling(client: Client) -> None:
+    """Of NFC: by path, by token, in a query and in answers; what nobody sees is refused."""
+    composed, apart = "Zo\xeb_\u0928\u0947\u0939\u093e", "Zoe\u0308_\u0928\u0947\u0939\u093e"
+    first = client.put(f"/v1/subjects/{apart}/enrollment", files=images(photo(1)))
+    assert (first.status_code, first.json()["replaced"]) == (201, False)
+    for spelled in (composed, apart):
+        assert client.get(f"/v1/subjects/{spelled}").json()["subject_id"] == composed
+        listed = client.get("/v1/subjects", params={"prefix": spelled}).json()["subjects"]
+        assert [each["subject_id"] for each in listed] == [composed]
+        lines = client.get("/v1/audit-log", params={"subject_id": spelled}).json()["lines"]
+        assert lines[-1]["action"] == "enroll"
+    asked = {"subject_id": apart, "action": "verify"}
+    token = client.post("/v1/tokens", json=asked).json()
+    assert token["subject_id"] == composed
+    answer = client.post(
+        f"/v1/subjects/{apart}/verify",
+        files=images(photo(1, 2), name="image"),
+        headers=bearer(token["token"]),
+    )
+    assert answer.json()["decision"] == "accept"
+    assert client.delete(f"/v1/subjects/{apart}").json()["claims"]["held"]
+    for refused in ("Zo\xeb\u200b", "Zo\xeb\u202e", "a\u00a0b", "\U0001f600", "%ff"):
+        assert_error(client.get(f"/v1/subjects/{refused}"), 422, "validation_failed")
+        asked = {"subject_id": refused, "action": "verify"}
+        assert_error(client.post("/v1/tokens", json=asked), 422, "validation_failed")

@@ -1,5 +1,6 @@
 import base64
 import random
+import unicodedata
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -116,9 +117,13 @@ def test_tenants_do_not_see_each_other(store: TemplateStore) -> None:
 @example("..")
 @example("...")
 def test_subject_ids_keep_to_the_rule(text: str) -> None:
-    allowed = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789._@:-"
-    if text not in ("", ".", "..") and all(character in allowed for character in text):
-        assert checked_subject_id(text) == text
+    normal = unicodedata.normalize("NFC", text)
+    marks = {"Mn", "Mc", "Me"}
+    if text not in ("", ".", "..") and all(
+        character.isalnum() or character in "._@:-" or unicodedata.category(character) in marks
+        for character in normal
+    ):
+        assert checked_subject_id(text) == normal == checked_subject_id(normal)
     else:
         with pytest.raises(InvalidIdentifier, match="1 to 128 characters"):
             checked_subject_id(text)
@@ -133,9 +138,50 @@ def test_a_bad_subject_id_is_refused_everywhere(store: TemplateStore) -> None:
         lambda bad: store.erasures.receipt("default", bad),
     )
     for call in calls:
-        for bad in ("", "x" * 129, "a b", "a/b", "ä", "a\n", "a\x00", "%", "..\\", ".", ".."):
+        for bad in (
+            "",
+            "x" * 129,
+            "a b",
+            "a/b",
+            "a\N{NO-BREAK SPACE}",
+            "a\N{ZERO WIDTH SPACE}",
+            "a\N{RIGHT-TO-LEFT OVERRIDE}",
+            "\ud800",
+            "\ue000",
+            "é" * 129,
+            "a\n",
+            "a\x00",
+            "%",
+            "..\\",
+            ".",
+            "..",
+        ):
             with pytest.raises(InvalidIdentifier):
                 call(bad)
+
+
+@pytest.mark.parametrize(
+    ("spelled", "stored"),
+    [
+        ("Zoe\N{COMBINING DIAERESIS}", "Zo\xeb"),
+        ("\N{ANGSTROM SIGN}sa", "\xc5sa"),
+        ("\u1112\u1161\u11ab", "\ud55c"),
+        ("\u0928\u0947\u0939\u093e", "\u0928\u0947\u0939\u093e"),
+        ("e\N{COMBINING ACUTE ACCENT}" * 128, "\xe9" * 128),
+    ],
+)
+def test_spellings_that_look_alike_are_one_subject(
+    store: TemplateStore, spelled: str, stored: str
+) -> None:
+    assert put(store, spelled, b"first").created
+    assert not put(store, stored, b"second").created
+    assert wire_of(store, spelled) == wire_of(store, stored) == b"second"
+    assert [each.subject_id for each in store.subjects.list("default").records] == [stored]
+    for prefix in (spelled, stored[:1], stored):
+        listed = store.subjects.list("default", prefix=prefix).records
+        assert [each.subject_id for each in listed] == [stored], prefix
+    assert store.erasures.erase("default", spelled).receipt.claims["held"]
+    assert store.subjects.describe("default", stored) is None
 
 
 @pytest.mark.parametrize("size", [0, 4 * 1024 * 1024 + 1])

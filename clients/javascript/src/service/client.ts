@@ -23,7 +23,7 @@ import { requireText, Sender, type ClientOptions } from "./sending.js";
 export const ENROLL_PHOTOS = 10;
 export const PROBE_PHOTOS = 5;
 
-const SUBJECT = /^(?!\.{1,2}$)[A-Za-z0-9._@:-]{1,128}$/;
+const SUBJECT = /^(?!\.{1,2}$)[\p{L}\p{M}\p{N}._@:-]{1,128}$/u;
 const TEMPLATE_ID = /^[A-Za-z0-9_-]{1,64}$/;
 const HOLDER_KEY_BYTES = 32;
 
@@ -240,12 +240,13 @@ export class Client extends Session {
   }
 }
 
-/** The path of a subject; a subject id needs no escapes in it. */
+/** The path of a subject, whose id the service reads in NFC. */
 export function subjectPath(subject: string, rest = ""): string {
-  if (!SUBJECT.test(requireText(subject, "a subject id"))) {
-    throw new RangeError("a subject id has 1 to 128 characters out of A-Z a-z 0-9 . _ @ : -");
+  const id = requireText(subject, "a subject id").normalize("NFC");
+  if (!SUBJECT.test(id)) {
+    throw new RangeError("a subject id has 1 to 128 characters: letters, marks and digits, and . _ @ : -");
   }
-  return `/v1/subjects/${subject}${rest}`;
+  return `/v1/subjects/${encodeURIComponent(id)}${rest}`;
 }
 
 /** The header that says what an enrollment may replace. */
