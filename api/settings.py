@@ -290,6 +290,12 @@ class Settings(BaseSettings):
     log_level: Literal["debug", "info", "warning", "error"] = Field(
         "info", description="Least severe log line that is written."
     )
+    root_path: str = Field(
+        "",
+        pattern=r"^(/[A-Za-z0-9._~-]+)*$",
+        description="Path under which a proxy shows the service, such as `/faces` "
+        "(docs/deploy.md). The proxy may pass it on or take it away.",
+    )
     web_page: bool = Field(True, description="Serve the web page at `/` (docs/javascript.md).")
     api_docs: bool = Field(
         True, description="Serve the reference of the API at `/docs`, for whoever reaches it."

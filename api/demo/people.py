@@ -4,19 +4,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from api.http.errors import StartError
+from api.http.routes.drawn_people import ENROLLED, ENROLLED_PHOTOS, PROBE_PHOTOS, STRANGERS
 from models.synthetic import draw_face, encode_photo
 from verify import LabelledFolder, labelled_folder
-
-ENROLLED_PHOTOS = 3
-PROBE_PHOTOS = 2
 
 
 @dataclass(frozen=True)
 class Scale:
     """How many people and photos the demo uses."""
 
-    enrolled: int = 8
-    strangers: int = 6
+    enrolled: int = len(ENROLLED)
+    strangers: int = len(STRANGERS)
     decoy_people: int = 600
     calibration_people: int = 100
     calibration_photos: int = 4
@@ -48,8 +46,8 @@ def drawn_cast(folder: Path, scratch: Path, size: Scale) -> tuple[Cast, list[Pat
                 path.write_bytes(encode_photo(draw_face(seed, photo)))
         return drawn
 
-    enrolled = draw(folder, 1, size.enrolled, ENROLLED_PHOTOS + PROBE_PHOTOS)
-    strangers = draw(folder, 101, size.strangers, 1)
+    enrolled = draw(folder, ENROLLED.start, size.enrolled, ENROLLED_PHOTOS + PROBE_PHOTOS)
+    strangers = draw(folder, STRANGERS.start, size.strangers, 1)
     decoys = draw(scratch / "decoys", 100_000, size.decoy_people, 1)
     draw(scratch / "faces", 200_000, size.calibration_people, size.calibration_photos)
     return (

@@ -22,11 +22,12 @@ from typing import Any
 import httpx
 
 from api.cli.calibration import calibrate_folder, default_probe_dims
-from api.demo.people import ENROLLED_PHOTOS, PROBE_PHOTOS, Cast, Scale, drawn_cast, found_cast
+from api.demo.people import Cast, Scale, drawn_cast, found_cast
 from api.demo.service import running_service
 from api.demo.storage import KEY_FILE, Stored, create_key, read_stored, rows_of
 from api.http.errors import StartError
 from api.http.receipts import read_receipt_key, verify_answer
+from api.http.routes.drawn_people import ENROLLED_PHOTOS, PROBE_PHOTOS
 from api.service.opening import file_sealer
 from api.service.settings_file import settings_text
 from models.demo import build_demo_pack, is_demo_model

@@ -8,7 +8,6 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
 from functools import cache, partial
 from importlib.metadata import version
-from types import ModuleType
 from typing import Any
 
 import anyio
@@ -28,7 +27,7 @@ from api.http.audit import note_refusal
 from api.http.context import RequestContext
 from api.http.deps import refuse_unknown
 from api.http.errors import ApiError, StartError, api_error, wrong_value
-from api.http.openapi import ERRORS, DescribedApi, allowed_methods, describe, operation_id
+from api.http.openapi import ERRORS, allowed_methods, describe, operation_id
 from api.http.routes import (
     audit_log,
     challenges,
@@ -45,8 +44,9 @@ from api.http.routes import (
     transfer,
     verification,
 )
+from api.http.routes.drawn_people import drawn_people_routes
 from api.http.routes.page import page_routes
-from api.http.routes.reference import reference_routes
+from api.http.routes.reference import document_routes, reference_routes
 from api.limits.admission import Gate
 from api.limits.rates import RateLimits
 from api.service.allocator import give_back, keep_few_arenas
@@ -131,33 +131,31 @@ def create_app(
                 raise
             yield
 
-    app = DescribedApi(
-        _document(),
-        lifespan=lifespan,
-        docs_url=None,
-        redoc_url=None,
-        openapi_url="/v1/openapi.json",
-        redirect_slashes=False,
-    )
+    app = FastAPI(lifespan=lifespan, openapi_url=None, redirect_slashes=False)
+    app.openapi = _document  # type: ignore[method-assign]
     app.state.settings = settings
-    app.router.routes.extend(_built(*API))
+    routes = app.router.routes
+    routes += _built()
+    routes += document_routes(_document(), root_path=settings.root_path)
     if settings.web_page:
-        app.router.routes.extend(page_routes(demo=settings.demo, serve_pack=settings.serve_pack))
+        routes += page_routes(demo=settings.demo, serve_pack=settings.serve_pack)
+    if settings.web_page and settings.demo:
+        routes += drawn_people_routes()
     if settings.api_docs:
-        app.router.routes.extend(reference_routes())
+        routes += reference_routes()
     _add_middleware(app, settings)
     return app
 
 
 @cache
-def _built(*modules: ModuleType) -> tuple[BaseRoute, ...]:
-    """The routes of modules, built now, and once for a process.
+def _built() -> tuple[BaseRoute, ...]:
+    """The routes of the calls, built now, and once for a process.
 
     By itself the framework builds them for the first request to any, under filters of its own for
     warnings. Those are the process's: a photo that is decoded meanwhile would change them.
     """
     router = APIRouter(generate_unique_id_function=operation_id)
-    for module in modules:
+    for module in API:
         router.include_router(
             module.router, dependencies=[Depends(refuse_unknown)], responses=ERRORS
         )
@@ -169,7 +167,7 @@ def _built(*modules: ModuleType) -> tuple[BaseRoute, ...]:
 @cache
 def _document() -> dict[str, Any]:
     """The OpenAPI document, made now and once for a process, for the reason of :func:`_built`."""
-    return describe(_built(*API), version=VERSION)
+    return describe(_built(), version=VERSION)
 
 
 def _lift_cohort(nobody: Nobody) -> None:
@@ -182,7 +180,12 @@ def _lift_cohort(nobody: Nobody) -> None:
 
 
 def _add_middleware(app: FastAPI, settings: Settings) -> None:
-    app.add_middleware(RequestContext, demo=settings.demo, tls=settings.tls_certificate is not None)
+    app.add_middleware(
+        RequestContext,
+        root_path=settings.root_path,
+        demo=settings.demo,
+        tls=settings.tls_certificate is not None,
+    )
     if settings.allowed_origins:
         # Keys travel in headers and never in a cookie, so credentials are not allowed: a page can
         # call with a key that it has, and with nothing that the browser keeps for the service.
@@ -283,7 +286,8 @@ async def _framework_error(request: Request, error: Exception) -> Response:
     headers = dict(error.headers or {})
     if code == "method_not_allowed":
         # The page's paths are not in the document; for them the framework knows.
-        allowed = allowed_methods(request.app.openapi(), request.url.path)
+        path = request.scope["path"].removeprefix(request.scope["root_path"])
+        allowed = allowed_methods(request.app.openapi(), path)
         headers["Allow"] = ", ".join(allowed) or headers.get("Allow", "")
     return await _known_error(request, ApiError(code, message, {}, headers))
 

@@ -47,12 +47,17 @@ class RequestContext:
 
     Parameters
     ----------
+    root_path
+        Path under which a proxy shows the service, which a request may have or not.
     demo, tls
         What the headers of every answer say.
     """
 
-    def __init__(self, app: ASGIApp, *, demo: bool = False, tls: bool = False) -> None:
+    def __init__(
+        self, app: ASGIApp, *, root_path: str = "", demo: bool = False, tls: bool = False
+    ) -> None:
         self._app = app
+        self._root_path = root_path
         self._headers = dict(SECURITY_HEADERS)
         if tls:
             self._headers["Strict-Transport-Security"] = HSTS
@@ -70,6 +75,7 @@ class RequestContext:
         request_id = request_id_of(Headers(scope=scope).get("x-request-id"))
         fields: dict[str, Any] = {}
         scope.setdefault("state", {}).update(request_id=request_id, log=fields)
+        scope["root_path"] = self._root_path
         started, status = time.perf_counter(), 0
 
         async def send_with_headers(message: Message) -> None:
@@ -141,7 +147,7 @@ class RequestContext:
 
 async def _require_few_requests(scope: Scope) -> None:
     """Refuse a client's address that sends too many, and a path that names another one."""
-    if scope["path"] not in HEALTH_PATHS:
+    if scope["path"].removeprefix(scope["root_path"]) not in HEALTH_PATHS:
         rate_limits: RateLimits = scope["app"].state.rate_limits
         await rate_limits.count_address(scope)
     if b"%2f" in scope.get("raw_path", b"").lower():

@@ -4,7 +4,6 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 from fastapi.routing import APIRoute
 from pydantic import BaseModel
@@ -30,18 +29,6 @@ ERRORS: dict[int | str, dict[str, Any]] = {
     "default": {"model": ErrorAnswer, "description": "An error, by its code."}
 }
 """What every call may answer."""
-
-
-class DescribedApi(FastAPI):
-    """An application whose OpenAPI document is there before a request asks for it."""
-
-    def __init__(self, document: dict[str, Any], **options: Any) -> None:
-        super().__init__(**options)
-        self._document = document
-
-    def openapi(self) -> dict[str, Any]:
-        """Return the OpenAPI document."""
-        return self._document
 
 
 def operation_id(route: APIRoute) -> str:

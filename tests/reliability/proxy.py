@@ -49,12 +49,19 @@ def write_configuration(block: str, folder: Path, listen: str) -> Path:
 @contextmanager
 def nginx(folder: Path, address: str, hosts: list[str], port: int) -> Iterator[str]:
     """Run nginx at an address, before hosts that serve on a port; gives its URL."""
-    require_nginx()
     (block,) = re.findall(r"```nginx\n(upstream .*?)```", PAGE, re.S)
     for number, host in enumerate(hosts):
         written = f"10.0.0.{11 + number}:8421"
         assert written in block
         block = block.replace(written, f"{host}:{port}")
+    with running_nginx(block, folder, address) as url:
+        yield url
+
+
+@contextmanager
+def running_nginx(block: str, folder: Path, address: str) -> Iterator[str]:
+    """Run nginx with a block of the pages, at an address; gives its URL."""
+    require_nginx()
     folder.mkdir()
     listen = f"{address}:{free_port()}"
     path = write_configuration(block, folder, listen)

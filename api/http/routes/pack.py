@@ -82,7 +82,7 @@ async def list_pack(call: AnyCall) -> PackAnswer:
                 file=graph.file,
                 sha256=graph.sha256,
                 bytes=graph.size,
-                path=f"{router.prefix}/{graph.sha256}",
+                path=f"{call.request.scope['root_path']}{router.prefix}/{graph.sha256}",
                 input_size=list(graph.input_size),
             )
             for graph in graphs.values()

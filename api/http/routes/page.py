@@ -1,12 +1,11 @@
-"""The web page: its files, from memory, and in the demo the drawn people to try it with.
+"""The web page: its files, from memory.
 
 Not part of the REST contract, so not in its document. What the page does, it does by calls that
-are: whoever has a key may do the same without it.
+are: whoever has a key may do the same without it. Its files name each other and the calls by
+relative URLs, so that a proxy may show the service under any path.
 """
 
-import functools
 import hashlib
-import re
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,11 +14,9 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import BaseRoute, Route
 
-from api.demo.people import ENROLLED_PHOTOS, PROBE_PHOTOS, Scale
-from api.http.answers import answer, has_copy
+from api.http.answers import has_copy
+from api.http.deps import refuse_unknown
 from api.http.errors import ApiError
-from api.limits.rates import address_of
-from models.synthetic import draw_face, encode_photo
 
 WEB = Path(__file__).resolve().parents[2] / "web"
 CLIENT = WEB / "client"
@@ -30,6 +27,7 @@ TYPES = {
     ".js": "text/javascript; charset=utf-8",
     ".svg": "image/svg+xml",
     ".mjs": "text/javascript; charset=utf-8",
+    ".json": "application/json",
     ".wasm": "application/wasm",
 }
 HEADERS = {
@@ -50,11 +48,6 @@ WITH_GRAPHS = {
         "script-src 'self'", "script-src 'self' 'wasm-unsafe-eval'"
     ),
 }
-
-FIRST_STRANGER = 101
-SHOTS = ENROLLED_PHOTOS + PROBE_PHOTOS
-_PERSON = re.compile(r"person-([1-9][0-9]{0,3})")
-_SHOT = re.compile(r"(0|[1-9])\.png")
 
 Endpoint = Callable[[Request], Awaitable[Response]]
 
@@ -84,7 +77,7 @@ class Served:
 
 
 def page_routes(*, demo: bool, serve_pack: bool) -> list[BaseRoute]:
-    """Return the routes of the page; those of the drawn people only with the demo model."""
+    """Return the routes of the page."""
     # Not in the demo, whose model knows a cartoon face by a check that no graph holds.
     lifts = serve_pack and not demo
     client = _built_client(with_runtime=lifts)
@@ -108,13 +101,7 @@ def page_routes(*, demo: bool, serve_pack: bool) -> list[BaseRoute]:
             raise ApiError("not_found", "there is no such path")
         return file.answer(request, headers)
 
-    routes: list[BaseRoute] = [route_of("/", page), route_of("/assets/{name:path}", asset)]
-    if demo:
-        routes += [
-            route_of("/demo/people", demo_people),
-            route_of("/demo/people/{person}/{shot}", demo_photo),
-        ]
-    return routes
+    return [route_of("/", page), route_of("/assets/{name:path}", asset)]
 
 
 def _built_client(*, with_runtime: bool) -> dict[str, Served]:
@@ -133,43 +120,8 @@ def route_of(path: str, endpoint: Endpoint) -> Route:
     async def named(request: Request) -> Response:
         # What log lines and metrics call it, as FastAPI does for its own routes.
         request.scope["route"] = route
+        await refuse_unknown(request)
         return await endpoint(request)
 
     route = Route(path, named, methods=["GET"])
     return route
-
-
-async def demo_people(request: Request) -> Response:
-    """List the drawn people, those whom `veilface demo` enrolls first."""
-    names = [f"person-{number}" for number in _drawn()]
-    return answer(request, {"people": names, "shots": SHOTS})
-
-
-async def demo_photo(request: Request) -> Response:
-    """Draw one photo of one of them; the same path gives the same bytes."""
-    person = _PERSON.fullmatch(request.path_params["person"])
-    shot = _SHOT.fullmatch(request.path_params["shot"])
-    if person is None or shot is None or int(person[1]) not in _drawn() or int(shot[1]) >= SHOTS:
-        raise ApiError("not_found", "there is no such cartoon person or photo")
-    gate = request.app.state.gate
-    address = address_of(request.client.host if request.client else "")
-    body = await gate.compute(functools.partial(_draw, int(person[1]), int(shot[1])), key=address)
-    return Response(
-        body,
-        media_type="image/png",
-        headers={**HEADERS, "Cache-Control": "private, max-age=3600"},
-    )
-
-
-@functools.cache
-def _draw(person: int, shot: int) -> bytes:
-    # Fewer than a hundred pictures of 20 KB: all of them may stay.
-    return encode_photo(draw_face(person, shot))
-
-
-def _drawn() -> list[int]:
-    scale = Scale()
-    return [
-        *range(1, 1 + scale.enrolled),
-        *range(FIRST_STRANGER, FIRST_STRANGER + scale.strangers),
-    ]

@@ -1,10 +1,13 @@
-"""The API reference at `/docs`: Swagger UI, by files that a package brings, from memory.
+"""The OpenAPI document, and its reference at `/docs`: Swagger UI, by files that a package brings.
 
-It reads `/v1/openapi.json` of this service and names no other host. A key that is entered there is
-kept by the page until it is closed.
+All are served from memory, and name each other by relative URLs and no other host. A key that is
+entered there is kept by the page until it is closed.
 """
 
+import json
+from collections.abc import Mapping
 from importlib.resources import files
+from typing import Any
 
 from starlette.requests import Request
 from starlette.responses import Response
@@ -14,12 +17,12 @@ from api.http.routes.page import HEADERS, Served, route_of
 
 PAGE = """<!doctype html><html lang="en"><head><meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1"><title>Veilface API</title>
-<link rel="stylesheet" href="/docs/swagger-ui.css"></head><body><main id="reference"></main>
-<script src="/docs/swagger-ui-bundle.js"></script><script src="/docs/start.js"></script>
+<link rel="stylesheet" href="docs/swagger-ui.css"></head><body><main id="reference"></main>
+<script src="docs/swagger-ui-bundle.js"></script><script src="docs/start.js"></script>
 </body></html>
 """
 START = """SwaggerUIBundle({
-  url: "/v1/openapi.json", dom_id: "#reference", deepLinking: true, validatorUrl: null,
+  url: "v1/openapi.json", dom_id: "#reference", deepLinking: true, validatorUrl: null,
 });
 """
 POLICY = {
@@ -43,7 +46,19 @@ def reference_routes() -> list[BaseRoute]:
             brought.joinpath(name).read_bytes(), name[name.rindex(".") :]
         )
 
-    async def file(request: Request) -> Response:
-        return served[request.url.path].answer(request, POLICY)
+    return [_file(path, file, POLICY) for path, file in served.items()]
 
-    return [route_of(path, file) for path in served]
+
+def document_routes(document: Mapping[str, Any], *, root_path: str) -> list[BaseRoute]:
+    """Return the route of the OpenAPI document; under a path of a proxy, it names that path."""
+    if root_path:
+        document = {"servers": [{"url": root_path}], **document}
+    file = Served.of(json.dumps(document, separators=(",", ":")).encode(), ".json")
+    return [_file("/v1/openapi.json", file, {"Cache-Control": "no-cache"})]
+
+
+def _file(path: str, file: Served, headers: Mapping[str, str]) -> BaseRoute:
+    async def serve(request: Request) -> Response:
+        return file.answer(request, headers)
+
+    return route_of(path, serve)

@@ -20,7 +20,8 @@ def operations(client: Client) -> Iterator[tuple[str, str]]:
 
 
 def test_no_call_takes_an_unknown_query_parameter(client: Client) -> None:
-    calls = list(operations(client))
+    pages = [("GET", path) for path in ("/", "/assets/main.js", "/docs", "/v1/openapi.json")]
+    calls = [*operations(client), *pages]
     assert ("GET", "/health/live") in calls
     for method, path in calls:
         answer = client.request(method, path, params={"dry_run": "true"})
