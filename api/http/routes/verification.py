@@ -2,15 +2,19 @@
 
 The order of a verification, which is what bounds an attacker::
 
-    body read ─▶ level, liveness, one use ─▶ probe ─▶ locked out? template ─▶ decision
+    body read ─▶ level, liveness ─▶ one read: used? locked out? template ─▶ probe ─▶ decision
         ─▶ one write: token used up, lockout checked and counted, audit line ─▶ answer
+
+A locked subject's photo is not looked at. The lock is read first, and it is on those who are
+enrolled and on those who are not. A template, or the stand-in, is opened before the photo is looked
+at, so that the time of a photo that is refused does not tell them apart either.
 
 No decision leaves before that write has committed. So of requests that run at the same time
 no more are answered than of requests that come one after the other.
 """
 
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 
 from fastapi import APIRouter
 
@@ -166,7 +170,8 @@ def _decide(
     if call.token is not None:
         # Once more: the body and the turn to compute may have taken a while.
         call.token.require_in_time()
-    probe = _probe(runtime, sent, challenge)
+    # Once, however often the template is replaced meanwhile.
+    probe_of = cache(partial(_probe, runtime, sent, challenge))
     live = challenge is not None or runtime.liveness.policy.passive
     spent = challenge or call.token
 
@@ -177,6 +182,7 @@ def _decide(
         elif call.sees_enrollment:
             raise _why_not(runtime, call.tenant, subject)
         stored = template or runtime.stand_in.open()
+        probe = probe_of()
         verifier = runtime.verifier(call.tenant, epoch)
         with step("decide"):
             if isinstance(probe, bytes):

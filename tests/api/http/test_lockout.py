@@ -70,6 +70,21 @@ def test_the_count_is_the_subjects_not_the_keys(both: tuple[Client, Deployment])
     assert attempt(client, keys[0], 3, "bob").json()["decision"] == "accept"
 
 
+@pytest.mark.parametrize("subject", ["alice", "nobody"])
+def test_a_locked_subjects_photo_is_not_looked_at(
+    both: tuple[Client, Deployment], subject: str
+) -> None:
+    client, deployment = both
+    enroll(client)
+    token = deployment.key("verify")
+    path, no_picture = f"/v1/subjects/{subject}/verify", images(b"no picture", name="image")
+    refused = client.post(path, files=no_picture, headers=bearer(token))
+    assert_error(refused, 400, "unsupported_image")
+    fail(client, token, AFTER, subject)
+    refused = client.post(path, files=no_picture, headers=bearer(token))
+    assert_error(refused, 423, "locked_out")
+
+
 def test_an_accept_sets_the_count_back(both: tuple[Client, Deployment]) -> None:
     client, deployment = both
     enroll(client)

@@ -67,16 +67,18 @@ def test_who_is_not_enrolled_looks_like_who_does_not_match(
         assert_error(told, 404, "not_enrolled")
 
 
+@pytest.mark.parametrize("face", [photo(2), b"no picture"], ids=["rejected", "refused"])
 def test_who_is_not_enrolled_costs_the_same_steps(
-    client: Client, token: str, monkeypatch: pytest.MonkeyPatch
+    client: Client, token: str, monkeypatch: pytest.MonkeyPatch, face: bytes
 ) -> None:
     from sqlalchemy import event
 
     runtime = client.app.state.runtime
     seen: dict[str, list[str]] = {}
     engine = runtime.store.database.engine
+    sent = images(face, name="image")
     for subject in ("alice", "nobody"):
-        ask(client, token, subject, files=images(photo(2), name="image"))  # caches are warm
+        ask(client, token, subject, files=sent)  # caches are warm
         steps: list[str] = []
 
         def record(_c: object, _u: object, statement: str, *rest: object) -> None:
@@ -90,7 +92,7 @@ def test_who_is_not_enrolled_costs_the_same_steps(
             # AESGCM is final in some releases: wrap by composition there.
             patch.setattr(envelope, "AESGCM", counting_cipher(steps))
             patch.setattr(sealing, "AESGCM", counting_cipher(steps))
-            ask(client, token, subject, files=images(photo(2), name="image"))
+            ask(client, token, subject, files=sent)
         event.remove(engine, "before_cursor_execute", record)
         seen[subject] = steps
     assert seen["alice"] == seen["nobody"]
