@@ -268,21 +268,10 @@ TARGETS: dict[str, Callable[[Path], Target]] = {
     "decoys": decoys,
     "body": body,
 }
-SHARES = {
-    "image": 6,
-    "template": 3,
-    "probe": 2,
-    "export": 2,
-    "bin": 4,
-    "contract": 3,
-    "decoys": 2,
-    "body": 2,
-}
-"""Parts of the time that each target gets."""
 
 
 def target_of(name: str) -> Callable[[Path], Target]:
-    """The maker of a target, or of one of the faulty ones that the tests of the runner use."""
+    """The maker of a target, or of one of the faulty ones that the tests use."""
     from tests.fuzz.faulty import FAULTY
 
     return TARGETS[name] if name in TARGETS else FAULTY[name]
