@@ -3,8 +3,7 @@
 from datetime import UTC, datetime
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, PlainSerializer
-from pydantic_core import CoreSchema
+from pydantic import BaseModel, ConfigDict, Field, PlainSerializer
 
 from api.http.errors import ERROR_CODES
 from templates.store.api_keys import Right
@@ -37,20 +36,10 @@ class _Shape(BaseModel):
 
 
 class _Answer(_Shape):
-    """What every answer has besides its own, which comes first."""
+    """What every answer has."""
 
     request_id: str = Field(description="Also in X-Request-ID.", examples=[REQUEST_ID])
     notice: str | None = Field(None, description="Only with the demo model.", exclude_if=_is_none)
-
-    @classmethod
-    def __get_pydantic_core_schema__(
-        cls, source: type[BaseModel], handler: GetCoreSchemaHandler
-    ) -> CoreSchema:
-        schema: Any = handler(source)
-        fields = schema["schema"]["fields"]
-        for name in ("notice", "request_id"):
-            fields[name] = fields.pop(name)
-        return schema  # type: ignore[no-any-return]
 
 
 class ErrorBody(_Shape):
@@ -260,10 +249,8 @@ class ErasedItem(_Shape):
     count: int
 
 
-class ReceiptClaims(BaseModel):
+class ReceiptClaims(_Shape):
     """What `body` says, for reading only: it is not signed in this form."""
-
-    model_config = ConfigDict(extra="forbid")
 
     kind: Literal["veilface-erasure-receipt"]
     version: Literal[1]

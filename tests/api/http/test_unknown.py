@@ -161,3 +161,26 @@ def test_a_charset_and_a_byte_order_mark_change_nothing(client: Client) -> None:
         headers={"Content-Type": "Application/JSON; charset=UTF-8"},
     )
     assert answer.status_code == 201
+
+
+def test_text_that_utf8_cannot_carry(client: Client) -> None:
+    for labels in ('{"race": "\\ud800"}', '{"gender": "\\u0000"}', '{"gender": "a\\nb"}'):
+        answer = client.put(
+            "/v1/subjects/surrogate/enrollment",
+            files=images(photo(1)),
+            data={"attributes": labels},
+        )
+        assert_error(answer, 422, "validation_failed")
+    answer = client.post(
+        "/v1/subjects/a/verify",
+        content=b'{"embedding": [1.0], "level": "\\ud800"}',
+        headers={"Content-Type": "application/json"},
+    )
+    assert_error(answer, 422, "validation_failed")
+
+
+def test_a_key_that_is_not_ascii(client: Client) -> None:
+    for value in (b"Bearer \xff\xfe", "Bearer ключ".encode()):
+        answer = client.get("/v1/contract", headers={"Authorization": value})
+        assert_error(answer, 401, "unauthorized")
+    assert client.get("/v1/contract", headers=bearer("vf_x")).status_code == 401
