@@ -127,5 +127,5 @@ def open_export(data: bytes, *, key: ExportKey, tenant: str, contract_id: str) -
             "another tenant"
         ) from None
     except ValidationError:
-        # Whoever has the key may still have sealed nonsense.
+        # A holder of the key may still have sealed nonsense.
         raise InvalidTemplate("the export holds no subject") from None

@@ -59,7 +59,7 @@ async def get_generator(call: Lifts) -> Response:
     headers = {
         "X-Decoy-Source-ID": source.source_id,
         "ETag": f'"{source.source_id}"',
-        # The path does not name the content. And whoever uses a copy must still have the right.
+        # The path does not name the content, and a user of a copy must still have the right.
         "Cache-Control": "private, no-cache",
     }
     if has_copy(call.request, headers["ETag"]):

@@ -1,7 +1,7 @@
 """The web page: its files, from memory.
 
-Not part of the REST contract, so not in its document. What the page does, it does by calls that
-are: whoever has a key may do the same without it. Its files name each other and the calls by
+Not part of the REST contract, so not in its document. The page works by the calls that are in it,
+and anybody with a key may do the same without the page. Its files name each other and the calls by
 relative URLs, so that a proxy may show the service under any path.
 """
 

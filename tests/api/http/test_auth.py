@@ -2,7 +2,7 @@ import pytest
 
 from api.service.opening import open_keyring, open_store
 from tests.api.client import Client
-from tests.api.deployment import Deployment, bearer, images, photo
+from tests.api.deployment import Deployment, bearer
 from tests.api.shapes import assert_error
 
 CALLS = [
@@ -88,16 +88,6 @@ def test_a_wrong_secret_of_a_known_prefix_is_refused(
 @pytest.mark.parametrize("path", ["/health/live", "/health/ready"])
 def test_health_needs_no_key(client: Client, method: str, path: str) -> None:
     assert client.request(method, path, headers={"Authorization": ""}).status_code == 200
-
-
-def test_a_key_of_photos_only_works(client: Client, deployment: Deployment) -> None:
-    app = bearer(deployment.key("enroll", "verify"))
-    put = client.put("/v1/subjects/app/enrollment", files=images(photo(4)), headers=app)
-    assert put.status_code == 201
-    probe = client.post(
-        "/v1/subjects/app/verify", files=images(photo(4, 1), name="image"), headers=app
-    )
-    assert probe.json()["decision"] == "accept"
 
 
 @pytest.mark.parametrize(

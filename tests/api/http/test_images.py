@@ -148,11 +148,6 @@ def test_the_largest_face_is_taken_when_asked_for(
     assert answer.json()["decision"] == "accept"
 
 
-def test_damaged_real_photos(real: Client, faces: list[np.ndarray[Any, Any]]) -> None:
-    cases = list(damaged(faces[0]))[::3]
-    assert failures(real, cases) == []
-
-
 @pytest.mark.long
 def test_enrolling_awkward_photos_changes_nothing(
     real: Client, faces: list[np.ndarray[Any, Any]]

@@ -101,18 +101,6 @@ def test_what_is_no_photo_is_an_error_as_elsewhere(
     assert_error(client.post(PATH, headers=headers, **request_of), status, code)
 
 
-def test_limits_of_size_hold(tmp_path: Path) -> None:
-    deployment = deploy(tmp_path, max_image_bytes=2048, rate_limit_key="4/minute")
-    with Client(create_app(deployment.settings), headers=bearer(deployment.token)) as client:
-        big = client.post(PATH, files=images(b"x" * 4096, name="image"))
-        assert_error(big, 413, "image_too_large")
-        for _ in range(3):
-            client.get("/v1/key")
-        limited = client.post(PATH, files=images(photo(1), name="image"))
-        assert_error(limited, 429, "rate_limited")
-        assert int(limited.headers["retry-after"]) > 0
-
-
 def test_a_service_without_a_pack_says_so(tmp_path: Path) -> None:
     deployment = deploy(tmp_path)
     settings = deployment.settings.model_copy(update={"pack": None})
