@@ -91,17 +91,18 @@ class Call:
         notice = DEMO_NOTICE if self.runtime.settings.demo else None
         return {"request_id": self.request.state.request_id, "notice": notice}
 
-    def require(self, right: str) -> None:
-        """Refuse unless the caller has this right.
+    def require(self, *rights: str) -> None:
+        """Refuse unless the caller has one of these rights.
 
         Raises
         ------
         ApiError
-            ``forbidden``.
+            ``forbidden``; it names the rights.
         """
-        if right not in self.rights:
+        if not self.rights & {*rights}:
+            named = " or ".join(rights)
             raise ApiError(
-                "forbidden", f"this API key lacks the right {right}", {"missing": [right]}
+                "forbidden", f"this API key lacks the right {named}", {"missing": [*rights]}
             )
 
     def note_subject(self, subject: str) -> str:
@@ -193,33 +194,20 @@ def _recognised(runtime: Runtime, text: str) -> tuple[ApiKey | None, SubjectToke
 AnyCall = Annotated[Call, Depends(call_of)]
 
 
-@dataclass(frozen=True)
-class Holding:
+def _holding(*rights: str) -> Any:
     """A dependency that demands one of some rights, before anything of the body is read."""
 
-    rights: tuple[str, ...]
-
-    async def __call__(self, call: AnyCall) -> Call:
-        """Return the call.
-
-        Raises
-        ------
-        ApiError
-            ``forbidden``; it names the rights.
-        """
-        if not call.rights & {*self.rights}:
-            raise ApiError(
-                "forbidden",
-                f"this API key lacks the right {' or '.join(self.rights)}",
-                {"missing": list(self.rights)},
-            )
+    async def holding(call: AnyCall) -> Call:
+        call.require(*rights)
         return call
 
+    return Depends(holding)
 
-Enrolls = Annotated[Call, Depends(Holding(("enroll",)))]
-Verifies = Annotated[Call, Depends(Holding(("verify",)))]
-EnrollsOrVerifies = Annotated[Call, Depends(Holding(("enroll", "verify")))]
-Erases = Annotated[Call, Depends(Holding(("erase",)))]
-Exports = Annotated[Call, Depends(Holding(("export",)))]
-Administers = Annotated[Call, Depends(Holding(("admin",)))]
-Lifts = Annotated[Call, Depends(Holding(("embeddings",)))]
+
+Enrolls = Annotated[Call, _holding("enroll")]
+Verifies = Annotated[Call, _holding("verify")]
+EnrollsOrVerifies = Annotated[Call, _holding("enroll", "verify")]
+Erases = Annotated[Call, _holding("erase")]
+Exports = Annotated[Call, _holding("export")]
+Administers = Annotated[Call, _holding("admin")]
+Lifts = Annotated[Call, _holding("embeddings")]

@@ -46,79 +46,68 @@ class ErrorCode:
     meaning: str
 
 
-ERROR_CODES: dict[str, ErrorCode] = {
-    entry.code: entry
-    for entry in (
-        ErrorCode(
-            "malformed_request",
-            400,
-            "The body does not match its content type, or the request is not well-formed HTTP.",
-        ),
-        ErrorCode("unsupported_image", 400, "The photo cannot be decoded safely."),
-        ErrorCode(
-            "invalid_template",
-            400,
-            "The template does not follow the format or exceeds its limits.",
-        ),
-        ErrorCode(
-            "invalid_embedding",
-            400,
-            "The embedding is not a finite unit vector of n numbers, or has no part along the "
-            "contract's axes.",
-        ),
-        ErrorCode(
-            "unauthorized",
-            401,
-            "The API key or token is missing, unknown or revoked.",
-        ),
-        ErrorCode(
-            "replayed",
-            401,
-            "The challenge or the token was used before, or has expired.",
-        ),
-        ErrorCode(
-            "forbidden",
-            403,
-            "The API key lacks the right or asks for too low a level, the token is for something "
-            "else, the tenant forbids it, or "
-            "liveness is asked for and the probe cannot show it.",
-        ),
-        ErrorCode("not_enrolled", 404, "Nobody is enrolled under this id."),
-        ErrorCode("not_found", 404, "There is nothing at this path."),
-        ErrorCode("method_not_allowed", 405, "The path exists, but not with this method."),
-        ErrorCode("contract_mismatch", 409, "The template belongs to another contract."),
-        ErrorCode(
-            "enrollment_conflict",
-            409,
-            "The subject has another template than the one that `If-None-Match` or `If-Match` "
-            "lets the request replace.",
-        ),
-        ErrorCode("image_too_large", 413, "The photo is too large, in bytes or pixels."),
-        ErrorCode("request_too_large", 413, "The request body is too large."),
-        ErrorCode("too_many_images", 413, "The request has too many photos."),
-        ErrorCode("no_face", 422, "No face was found in the photo."),
-        ErrorCode(
-            "multiple_faces",
-            422,
-            "The photo shows several faces, and none is clearly the one that is meant.",
-        ),
-        ErrorCode("face_too_small", 422, "The face is too small in the photo."),
-        ErrorCode(
-            "low_quality",
-            422,
-            "The photo is turned, blurred or dark, the pose extreme, or part of the face hidden.",
-        ),
-        ErrorCode("inconsistent_images", 422, "The photos do not all show the same person."),
-        ErrorCode("uncalibrated", 422, "The contract has no calibration for what was asked."),
-        ErrorCode("validation_failed", 422, "A field is missing, unknown, or has a wrong value."),
-        ErrorCode("locked_out", 423, "Too many failed attempts for this subject."),
-        ErrorCode("rate_limited", 429, "Too many requests with this API key or from this address."),
-        ErrorCode("internal_error", 500, "A bug in the service: report the request id."),
-        ErrorCode("model_unavailable", 503, "The service runs without a model pack."),
-        ErrorCode("store_unavailable", 503, "The database does not respond."),
-        ErrorCode("overloaded", 503, "Too many requests are waiting, or the worker is stopping."),
-    )
-}
+_CODES = (
+    ErrorCode(
+        "malformed_request",
+        400,
+        "The body does not match its content type, or the request is not well-formed HTTP.",
+    ),
+    ErrorCode("unsupported_image", 400, "The photo cannot be decoded safely."),
+    ErrorCode(
+        "invalid_template",
+        400,
+        "The template does not follow the format or exceeds its limits.",
+    ),
+    ErrorCode(
+        "invalid_embedding",
+        400,
+        "The embedding is not a finite unit vector of n numbers, or has no part along the "
+        "contract's axes.",
+    ),
+    ErrorCode("unauthorized", 401, "The API key or token is missing, unknown or revoked."),
+    ErrorCode("replayed", 401, "The challenge or the token was used before, or has expired."),
+    ErrorCode(
+        "forbidden",
+        403,
+        "The API key lacks the right or asks for too low a level, the token is for something "
+        "else, the tenant forbids it, or liveness is asked for and the probe cannot show it.",
+    ),
+    ErrorCode("not_enrolled", 404, "Nobody is enrolled under this id."),
+    ErrorCode("not_found", 404, "There is nothing at this path."),
+    ErrorCode("method_not_allowed", 405, "The path exists, but not with this method."),
+    ErrorCode("contract_mismatch", 409, "The template belongs to another contract."),
+    ErrorCode(
+        "enrollment_conflict",
+        409,
+        "The subject has another template than the one that `If-None-Match` or `If-Match` "
+        "lets the request replace.",
+    ),
+    ErrorCode("image_too_large", 413, "The photo is too large, in bytes or pixels."),
+    ErrorCode("request_too_large", 413, "The request body is too large."),
+    ErrorCode("too_many_images", 413, "The request has too many photos."),
+    ErrorCode("no_face", 422, "No face was found in the photo."),
+    ErrorCode(
+        "multiple_faces",
+        422,
+        "The photo shows several faces, and none is clearly the one that is meant.",
+    ),
+    ErrorCode("face_too_small", 422, "The face is too small in the photo."),
+    ErrorCode(
+        "low_quality",
+        422,
+        "The photo is turned, blurred or dark, the pose extreme, or part of the face hidden.",
+    ),
+    ErrorCode("inconsistent_images", 422, "The photos do not all show the same person."),
+    ErrorCode("uncalibrated", 422, "The contract has no calibration for what was asked."),
+    ErrorCode("validation_failed", 422, "A field is missing, unknown, or has a wrong value."),
+    ErrorCode("locked_out", 423, "Too many failed attempts for this subject."),
+    ErrorCode("rate_limited", 429, "Too many requests with this API key or from this address."),
+    ErrorCode("internal_error", 500, "A bug in the service: report the request id."),
+    ErrorCode("model_unavailable", 503, "The service runs without a model pack."),
+    ErrorCode("store_unavailable", 503, "The database does not respond."),
+    ErrorCode("overloaded", 503, "Too many requests are waiting, or the worker is stopping."),
+)
+ERROR_CODES = {entry.code: entry for entry in _CODES}
 
 
 @dataclass(eq=False)

@@ -1,4 +1,4 @@
-"""What OpenAPI says of errors and request bodies, derived from the one table of codes."""
+"""What OpenAPI says of calls, errors and request bodies, which FastAPI cannot say by itself."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -9,7 +9,6 @@ from fastapi.routing import APIRoute
 from pydantic import BaseModel
 from starlette.routing import BaseRoute
 
-from api.http.errors import ERROR_CODES
 from api.http.schemas import ErrorAnswer
 
 DESCRIPTION = """\
@@ -78,29 +77,3 @@ def allowed_methods(document: Mapping[str, Any], path: str) -> list[str]:
     for template in sorted(fitting, key=lambda template: template.count("{")):
         return sorted(method.upper() for method in document["paths"][template])
     return []
-
-
-def calls_table(document: Mapping[str, Any]) -> str:
-    """Write the table of calls of ``docs/rest.md``: each with what its description says first."""
-    calls = [
-        (f"{method.upper()} {path}", operation)
-        for path, entry in document["paths"].items()
-        for method, operation in entry.items()
-    ]
-    groups = [tag["name"] for tag in document["tags"]]
-    calls.sort(key=lambda call: groups.index(call[1]["tags"][0]))
-    rows = ["| call | does | right |", "|---|---|---|"]
-    for name, operation in calls:
-        said = operation["description"].partition(". ")[0].partition(".\n")[0].rstrip(".")
-        right = " ".join(re.sub(r"^Rights?: ", "", said).split())
-        rows.append(f"| `{name}` | {operation['summary']} | {right} |")
-    return "\n".join(rows) + "\n"
-
-
-def codes_table() -> str:
-    """Write the table of error codes of ``docs/rest.md`` from the one table of codes."""
-    rows = ["| status | code | meaning |", "|---|---|---|"]
-    rows += [
-        f"| {entry.status} | `{entry.code}` | {entry.meaning} |" for entry in ERROR_CODES.values()
-    ]
-    return "\n".join(rows) + "\n"
