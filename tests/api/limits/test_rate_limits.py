@@ -4,7 +4,6 @@ import json
 import os
 import secrets
 import signal
-from collections import Counter
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from datetime import UTC, datetime
@@ -130,22 +129,6 @@ def test_the_next_one_is_refused_and_told_how_long_to_wait(make: Make) -> None:
             assert RATE_LIMITED.labels("key")._value.get() == before + 1
 
     anyio.run(scenario)
-
-
-def test_exactly_as_many_pass_as_may_however_many_come_at_once(make: Make) -> None:
-    outcomes: Counter[str] = Counter()
-
-    async def count(counted: RateLimits) -> None:
-        refused = await refusal(counted.count_key("a"))
-        outcomes["passed" if refused is None else refused.code] += 1
-
-    async def scenario() -> None:
-        async with make("50/day") as counted, anyio.create_task_group() as tasks:
-            for _ in range(200):
-                tasks.start_soon(count, counted)
-
-    anyio.run(scenario)
-    assert outcomes == {"passed": 50, "rate_limited": 150}
 
 
 def test_workers_share_a_limit_in_redis_and_not_without_it(
