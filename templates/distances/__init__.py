@@ -275,7 +275,7 @@ def _tiles(
     if np.dtype(dtype) == np.float32 and len(probes) * len(templates) > _FEW:
         compiled = _compiled()
     if compiled is None:
-        parts = exact.tiles(probes, templates, metric=metric, steps=steps)
+        parts = exact.tiles(probes, templates, metric=metric, steps=steps, dtype=dtype)
         return ((rows, columns, part.astype(dtype)) for rows, columns, part in parts)
     of_loops: Iterator[Tile] = compiled.tiles(
         probes, templates, metric=metric, steps=steps, threads=threads

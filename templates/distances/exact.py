@@ -9,13 +9,14 @@ length count. A subspace with foot point p meets the unit sphere in a sphere aro
 s = √(1 − ‖p‖²).
 """
 
+import math
 from collections.abc import Iterator
 from typing import Any, NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
-from templates.distances.metric import LONGEST, Indices, Metric, Probes, Tile, parts
+from templates.distances.metric import LONGEST, NEAR, STILL, Indices, Metric, Probes, Tile, parts
 from templates.space.subspace import SubspaceBatch
 
 _CHUNK_BYTES = 4 << 20
@@ -49,9 +50,26 @@ class Rows(NamedTuple):
 
 
 def tiles(
-    probes: Probes, templates: SubspaceBatch, *, metric: Metric, steps: int
+    probes: Probes,
+    templates: SubspaceBatch,
+    *,
+    metric: Metric,
+    steps: int,
+    dtype: DTypeLike = np.float64,
 ) -> Iterator[Tile]:
-    """Yield rows, columns and distances (R, C) of all parts of the matrix of every pair."""
+    """Yield rows, columns and distances (R, C) of all parts of the matrix of every pair.
+
+    ``dtype`` is that of the inner products of subspaces on the sphere: float32 leaves an error of
+    10⁻⁶ in a similarity, and reads a batch of templates as it lies.
+    """
+    if isinstance(probes, SubspaceBatch) and metric is Metric.SPHERICAL:
+        most = max(1, _CHUNK_BYTES // (8 * probes.m * templates.m))
+        height = min(_SIDE, len(probes), max(1, math.isqrt(most)))
+        for columns in parts(len(templates), max(1, min(_SIDE, most // max(1, height)))):
+            for rows in parts(len(probes), height):
+                sides = probes[rows], templates[columns]
+                yield rows, columns, _spherical_tile(*sides, steps, dtype)
+        return
     for columns in parts(len(templates), _SIDE):
         some = Rows.of(templates, columns)
         for rows in parts(len(probes), _SIDE):
@@ -59,11 +77,8 @@ def tiles(
             if isinstance(group, SubspaceBatch):
                 shape = len(group), len(some.feet)
                 i, j = (side.ravel() for side in np.indices(shape))
-                yield (
-                    rows,
-                    columns,
-                    pairs(group, some, i, j, metric=metric, steps=steps).reshape(shape),
-                )
+                of_pairs = pairs(group, some, i, j, metric=metric, steps=steps)
+                yield rows, columns, of_pairs.reshape(shape)
                 continue
             out = np.empty((len(group), len(some.feet)))
             points = group[None].astype(np.float64)
@@ -187,11 +202,11 @@ def _spherical_subspaces(
     """Distances from the similarity, and of near pairs from the closest points themselves."""
     if probes.bases.shape[1] < templates.bases.shape[1]:  # the smaller one is iterated over
         probes, templates, i, j = templates, probes, j, i
-    made = [problem_of(Rows.of(probes, i[part]), Rows.of(templates, j[part])) for part in chunks]
+    made = [_problem_of(Rows.of(probes, i[part]), Rows.of(templates, j[part])) for part in chunks]
     if not made:
         return np.empty(0)
-    dots, *fields = (np.concatenate(part) for part in zip(*made, strict=True))
-    problems = Problem(*fields)
+    dots = np.concatenate([of_pairs for of_pairs, _ in made])
+    problems = Problem(*map(np.concatenate, zip(*(of for _, of in made), strict=True)))
     v, gains = maximise(problems, starts_of(problems.gram), steps)
     squared = 2 - 2 * (dots + gains)
     near = np.flatnonzero(squared < _NEAR2)
@@ -203,6 +218,43 @@ def _spherical_subspaces(
         ends = right.feet * scales[:, None] + radii[:, None] * inside
         squared[some] = _spherical_points(ends[:, None], Rows.of(probes, i[some]))[:, 0] ** 2
     return np.sqrt(squared)
+
+
+def _spherical_tile(
+    probes: SubspaceBatch, templates: SubspaceBatch, steps: int, dtype: DTypeLike
+) -> Doubles:
+    """Distances (R, C) of every probe to every template, from one product of their rows.
+
+    Pairs so near that their squares lose digits of ``dtype`` are computed by :func:`pairs`.
+    """
+    if probes.m < templates.m:  # the smaller one is iterated over
+        return _spherical_tile(templates, probes, steps, dtype).T
+    shape, n = (len(probes), len(templates)), probes.n
+    (scale, s), (their_scale, t) = spheres(probes.feet), spheres(templates.feet)
+    p, q = probes.feet.astype(np.float64), templates.feet.astype(np.float64)
+    p, q = p * scale[:, None], q * their_scale[:, None]
+    left = probes.bases.reshape(-1, n).astype(dtype, copy=False)
+    right = templates.bases.reshape(-1, n)
+    # The rows of the larger subspaces are read once.
+    products = (left @ np.concatenate([right, q]).astype(dtype).T).astype(np.float64)
+    products = products.reshape(shape[0], probes.m, -1).transpose(0, 2, 1)
+    b = products[:, : len(right)].reshape(*shape, templates.m, probes.m).swapaxes(2, 3)
+    g = products[:, len(right) :]
+    h = (p @ right.T.astype(np.float64)).reshape(*shape, templates.m)
+    dots, problem = _problem(
+        (p @ q.T).ravel(),
+        (np.multiply.outer(s, t)[..., None, None] * b).reshape(-1, probes.m, templates.m),
+        (s[:, None, None] * g).reshape(-1, probes.m),
+        (t[:, None] * h).reshape(-1, templates.m),
+    )
+    single = np.dtype(dtype) == np.float32
+    still, near2 = (STILL, NEAR**2) if single else (_STILL, _NEAR2)
+    gains = maximise(problem, starts_of(problem.gram), steps, still=still)[1]
+    squared = 2 - 2 * (dots + gains)
+    out = np.sqrt(np.maximum(squared, 0)).reshape(shape)
+    i, j = np.nonzero((squared < near2).reshape(shape))
+    out[i, j] = pairs(probes, templates, i, j, metric=Metric.SPHERICAL, steps=steps)
+    return out
 
 
 # --- the sphere, and two subspaces on it ----------------------------------------------------
@@ -247,15 +299,20 @@ class Problem(NamedTuple):
     """‖g‖² of g = s D q, shape (K, 1)."""
 
 
-def problem_of(left: Rows, right: Rows) -> tuple[Doubles, ...]:
+def _problem(dots: Doubles, b: Doubles, g: Doubles, h: Doubles) -> tuple[Doubles, Problem]:
     """Products p·q of K pairs, (K,), and their problems: the similarity is p·q + max F."""
+    columns = b.transpose(0, 2, 1)
+    g2 = np.einsum("ki,ki->k", g, g)[:, None]
+    return dots, Problem(columns @ b, _times(columns, g), h, g2)
+
+
+def _problem_of(left: Rows, right: Rows) -> tuple[Doubles, Problem]:
+    """:func:`_problem` of K subspaces and as many others."""
     (scale, s), (their_scale, t) = spheres(left.feet), spheres(right.feet)
     p, q = left.feet * scale[:, None], right.feet * their_scale[:, None]
     b = (s * t)[:, None, None] * (left.bases @ right.bases.transpose(0, 2, 1))
-    g, columns = s[:, None] * _times(left.bases, q), b.transpose(0, 2, 1)
-    g2 = np.einsum("ki,ki->k", g, g)[:, None]
-    h = t[:, None] * _times(right.bases, p)
-    return np.einsum("ki,ki->k", p, q), columns @ b, _times(columns, g), h, g2
+    g, h = s[:, None] * _times(left.bases, q), t[:, None] * _times(right.bases, p)
+    return _problem(np.einsum("ki,ki->k", p, q), b, g, h)
 
 
 def starts_of(gram: Doubles) -> Doubles:
@@ -275,8 +332,12 @@ def starts_of(gram: Doubles) -> Doubles:
     return np.stack([leading, -leading], axis=1)
 
 
-def maximise(problem: Problem, starts: Doubles, steps: int) -> tuple[Doubles, Doubles]:
+def maximise(
+    problem: Problem, starts: Doubles, steps: int, *, still: float = _STILL
+) -> tuple[Doubles, Doubles]:
     """Best v over all starts (K, S, m), shape (K, m), and F(v), (K,).
+
+    A pair rests when a step moves v by less than ``still``.
 
     One step is v ← normalise(h + (c + G v)/λ), which never lowers F. It converges linearly, slowly
     where two eigenvalues are close; an Anderson extrapolation of depth one through the last two
@@ -300,7 +361,7 @@ def maximise(problem: Problem, starts: Doubles, steps: int) -> tuple[Doubles, Do
         trial = np.where(again, stepped, normalised(following - slope * (following - stepped)))
         moved, stepped = np.where(again, moved, motion), np.where(again, stepped, following)
         value = np.where(worse, value, new)
-        done = (~worse & (np.einsum("ksi,ksi->ks", motion, motion) < _STILL**2)).all(axis=1)
+        done = (~worse & (np.einsum("ksi,ksi->ks", motion, motion) < still**2)).all(axis=1)
         if taken == steps - 1 or (taken % 4 == 3 and done.any()):
             done |= taken == steps - 1
             values[active[done]], best[active[done]] = value[done], v[done]
