@@ -1,13 +1,12 @@
 """The connection to SQLite or PostgreSQL: transactions, waits, and errors in our own words.
 
-One :class:`Database` may be used by many threads, and survives a fork: each process makes its own
-connections. Writes are one at a time over all processes and hosts, on both databases. So what a
-write has read stays true until it commits, and no two writes wait for each other.
+One :class:`Database` may be used by many threads; each process opens its own. Writes are one at a
+time over all processes and hosts, on both databases. So what a write has read stays true until it
+commits, and no two writes wait for each other.
 """
 
 import contextlib
 import hashlib
-import os
 import sqlite3
 import threading
 import time
@@ -55,7 +54,7 @@ _BEGIN_WRITE = sa.select(
 
 
 class Database:
-    """An engine for each process, and the two ways to use it: :meth:`read` and :meth:`write`.
+    """The engine of a process, and the two ways to use it: :meth:`read` and :meth:`write`.
 
     Parameters
     ----------
@@ -79,15 +78,18 @@ class Database:
         self.url = checked_url(url)
         self.is_sqlite = self.url.get_backend_name() == "sqlite"
         self._file = sqlite_file(self.url) if self.is_sqlite else None
-        self._pool_size = pool_size
-        self._max_overflow = max_overflow
         self._timeout = timeout
-        self._own = self._new_process()
-
-    @property
-    def engine(self) -> Engine:
-        """The engine of this process."""
-        return self._process().engine
+        self._writing = threading.Lock()
+        self.engine = make_engine(
+            self.url, timeout=timeout, pool_size=pool_size, max_overflow=max_overflow
+        )
+        self._readers = self.engine
+        if not self.is_sqlite:
+            self._readers = self.engine.execution_options(isolation_level="AUTOCOMMIT")
+        self._opened = _identity(self._file)
+        if self.is_sqlite:
+            # SQLite would make an empty file, and the connection would stay with that one.
+            sa.event.listen(self.engine, "do_connect", lambda *_: self._require_file())
 
     def read(self, work: Callable[[Connection], T]) -> T:
         """Run `work` on a connection; what it sees is committed.
@@ -97,21 +99,20 @@ class Database:
         StoreUnavailable, StoreError
             In our own words, without a statement, its parameters or a row.
         """
-        return self._read(self._process().readers, work)
+        return self._read(self._readers, work)
 
     def snapshot(self, work: Callable[[Connection], T]) -> T:
         """:meth:`read`, where all queries of `work` see the same moment; no write waits for it."""
-        process = self._process()
         if self.is_sqlite:  # whose readers see one moment anyway
-            return self._read(process.readers, work)
+            return self.read(work)
         level = {"isolation_level": "REPEATABLE READ"}
-        return self._read(process.engine.execution_options(**level), work)
+        return self._read(self.engine.execution_options(**level), work)
 
     def _read(self, engine: Engine, work: Callable[[Connection], T]) -> T:
         with _translating(), engine.connect() as connection:
             if self.is_sqlite:
                 _driver(connection).execute("BEGIN")
-                self._process().require_file()
+                self._require_file()
             return work(connection)
 
     def write(self, work: Callable[[Connection], T], *, wait: float | None = None) -> T:
@@ -132,18 +133,17 @@ class Database:
         StoreUnavailable, StoreError
             As of :meth:`read`. Nothing was written.
         """
-        process = self._process()
         wait = self._timeout if wait is None else wait
         patience = wait or self._timeout
         until = time.monotonic() + patience
         # Threads queue here in turn: SQLite's own lock is polled and knows no order, and on
         # PostgreSQL each that waits would hold a connection that readers need.
-        turn = process.turn_to_write(patience)
-        with _translating(), turn, process.engine.begin() as connection:
+        turn = self._turn_of_threads(patience)
+        with _translating(), turn, self.engine.begin() as connection:
             if self.is_sqlite:
                 with self._turn(until), self._patience(connection, until) as driver:
                     driver.execute("BEGIN IMMEDIATE")
-                process.require_file()
+                self._require_file()
             else:
                 connection.execute(_BEGIN_WRITE, {"limit": str(round(1000 * wait))})
             return work(connection)
@@ -157,12 +157,11 @@ class Database:
         """
         if not self.is_sqlite:
             return True
-        process = self._process()
         with (
             contextlib.suppress(*_DATABASE_ERRORS, StoreError),
-            process.turn_to_write(self._timeout),
+            self._turn_of_threads(self._timeout),
             self._turn(time.monotonic() + PURGE_WAIT_S),
-            process.engine.connect() as connection,
+            self.engine.connect() as connection,
             self._patience(connection, time.monotonic() + PURGE_WAIT_S) as driver,
         ):
             busy, _, _ = driver.execute(_EMPTY_LOG).fetchone()
@@ -171,11 +170,10 @@ class Database:
 
     def compact(self, tables: Sequence[str]) -> None:
         """Rewrite tables (PostgreSQL) or the file (SQLite) without what was removed from them."""
-        process = self._process()
-        autocommit = process.engine.execution_options(isolation_level="AUTOCOMMIT")
+        autocommit = self.engine.execution_options(isolation_level="AUTOCOMMIT")
         with (
             _translating(),
-            process.turn_to_write(self._timeout),
+            self._turn_of_threads(self._timeout),
             self._turn(time.monotonic() + self._timeout),
             autocommit.connect() as connection,
         ):
@@ -197,7 +195,17 @@ class Database:
 
     def close(self) -> None:
         """Close the connections of this process that are idle."""
-        self._process().engine.dispose()
+        self.engine.dispose()
+
+    @contextlib.contextmanager
+    def _turn_of_threads(self, timeout: float) -> Iterator[None]:
+        """Hold the turn among the threads of this process; StoreBusy where it does not come."""
+        if not self._writing.acquire(timeout=timeout):
+            raise StoreBusy("other writes of this process take too long")
+        try:
+            yield
+        finally:
+            self._writing.release()
 
     def _turn(self, until: float) -> contextlib.AbstractContextManager[None]:
         """The turn to wait for SQLite's lock; nothing on PostgreSQL."""
@@ -213,66 +221,21 @@ class Database:
         finally:
             driver.execute(_busy_timeout(self._timeout))
 
-    def _process(self) -> "_Process":
-        if self._own.pid != os.getpid():
-            # The sockets and file locks of the parent are not ours: forget them, unclosed.
-            self._own.engine.dispose(close=False)
-            self._own = self._new_process()
-        return self._own
-
-    def _new_process(self) -> "_Process":
-        engine = make_engine(
-            self.url,
-            timeout=self._timeout,
-            pool_size=self._pool_size,
-            max_overflow=self._max_overflow,
-        )
-        return _Process(engine, self._file)
-
-    def __repr__(self) -> str:
-        return f"Database({self.url.render_as_string(hide_password=True)!r})"
-
-
-class _Process:
-    """What belongs to one process: its engine, and that seen as readers'."""
-
-    def __init__(self, engine: Engine, file: Path | None) -> None:
-        self.pid = os.getpid()
-        self.engine = engine
-        self._file = file
-        self._identity = _identity(file)
-        if file is not None:
-            # SQLite would make an empty file, and the connection would stay with that one.
-            sa.event.listen(engine, "do_connect", lambda *_: self.require_file())
-        self._writing = threading.Lock()
-        self.readers = (
-            engine
-            if engine.dialect.name == "sqlite"
-            else engine.execution_options(isolation_level="AUTOCOMMIT")
-        )
-
-    @contextlib.contextmanager
-    def turn_to_write(self, timeout: float) -> Iterator[None]:
-        """Hold the turn among the threads of this process; StoreBusy where it does not come."""
-        if not self._writing.acquire(timeout=timeout):
-            raise StoreBusy("other writes of this process take too long")
-        try:
-            yield
-        finally:
-            self._writing.release()
-
-    def require_file(self) -> None:
+    def _require_file(self) -> None:
         """Refuse to go on with a file that was removed: its writes would be gone with it.
 
         Raises
         ------
         DatabaseFileRemoved
         """
-        if _identity(self._file) != self._identity:
+        if _identity(self._file) != self._opened:
             raise DatabaseFileRemoved(
                 "the database file was removed or replaced while it was open: put it back, or stop "
                 "the service first and start it again"
             )
+
+    def __repr__(self) -> str:
+        return f"Database({self.url.render_as_string(hide_password=True)!r})"
 
 
 def _identity(file: Path | None) -> tuple[int, int] | None:

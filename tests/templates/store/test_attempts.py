@@ -531,7 +531,7 @@ def test_processes_count_together(ada: TemplateStore) -> None:
         for _ in range(6):
             print(attempt(ada).split()[0], file=output)
 
-    children = [fork(work) for _ in range(4)]
+    children = [fork(work, ada) for _ in range(4)]
     answers: Counter[str] = Counter()
     for child, output in children:
         with output:

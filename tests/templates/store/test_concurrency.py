@@ -74,13 +74,15 @@ def write_for_ever(store: TemplateStore, subject: str, output: TextIO) -> None:
         print(step, file=output, flush=True)
 
 
-def fork(work: Callable[[TextIO], None]) -> tuple[int, TextIO]:
-    """Run `work` in another process; returns its id and what it writes."""
+def fork(work: Callable[[TextIO], None], *stores: TemplateStore) -> tuple[int, TextIO]:
+    """Run `work`, which may use these stores, in another process; returns its id and output."""
     reading, writing = os.pipe()
     child = os.fork()
     if child == 0:
         try:
             os.close(reading)
+            for store in stores:  # their connections are the parent's
+                store.database.engine.dispose(close=False)
             with os.fdopen(writing, "w") as output:
                 work(output)
             os._exit(0)
@@ -142,7 +144,7 @@ def test_processes_on_the_same_subjects(store: TemplateStore) -> None:
     def work(seed: int) -> Callable[[TextIO], None]:
         return lambda output: json.dump(mix(store, seed, 60), output)
 
-    workers = [fork(work(seed)) for seed in range(10, 14)]
+    workers = [fork(work(seed), store) for seed in range(10, 14)]
     done: Counter[str] = Counter()
     for child, output in workers:
         with output:
@@ -157,7 +159,7 @@ def test_a_killed_writer_leaves_whole_subjects(store: TemplateStore) -> None:
     generator = random.Random(5)
     for round_number in range(12):
         subject = f"s{round_number}"
-        child, output = fork(lambda to, subject=subject: write_for_ever(store, subject, to))
+        child, output = fork(lambda to, subject=subject: write_for_ever(store, subject, to), store)
         with output:
             acknowledged = [output.readline() for _ in range(generator.randrange(1, 12))]
             time.sleep(generator.uniform(0, 0.02))

@@ -1,5 +1,4 @@
 import contextlib
-import os
 import socket
 import sqlite3
 import stat
@@ -348,21 +347,3 @@ def test_all_connections_busy_is_store_unavailable(database_url: str) -> None:
         leave.set()
         thread.join()
         database.close()
-
-
-@pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork:DeprecationWarning")
-def test_a_forked_child_makes_its_own_connections(store: TemplateStore) -> None:
-    put(store, "parent", b"p")
-    child = os.fork()
-    if child == 0:
-        try:
-            found = store.subjects.get("default", "parent")
-            put(store, "child", b"c")
-            os._exit(0 if found is not None and found.wire == b"p" else 1)
-        except BaseException:
-            os._exit(2)
-    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
-    for subject, wire in (("parent", b"p"), ("child", b"c")):
-        found = store.subjects.get("default", subject)
-        assert found is not None
-        assert found.wire == wire
