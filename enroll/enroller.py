@@ -233,9 +233,10 @@ class Enroller:
                 stream=stream,
                 attributes=named,
             )
-        turned, salt = self._turned_by_holder(lifted[0], holder)
-        return self._finish(
-            turned, per_photo=tuple(results), photos=len(distinct_rows(rows)), holder_salt=salt
+        return self._enrollment(
+            *self._turned_by_holder(lifted[0], holder),
+            per_photo=tuple(results),
+            photos=len(distinct_rows(rows)),
         )
 
     def from_template(self, data: bytes, *, holder: Holder | None = None) -> Enrollment:
@@ -265,8 +266,7 @@ class Enroller:
                 "the template lies nearer to strangers than the contract recorded of honest ones: "
                 "lift photos of one person with the contract's decoys"
             )
-        turned, salt = self._turned_by_holder(subspace, holder)
-        return self._of(turned, holder_salt=salt)
+        return self._spanned_anew(*self._turned_by_holder(subspace, holder))
 
     def from_export(self, data: bytes, *, holder_salt: str | None = None) -> Enrollment:
         """Enroll the template of an export that a service sealed, without the tenant's rotation.
@@ -279,7 +279,7 @@ class Enroller:
         holder_salt
             Of the holder's rotation; None where the template needs no key.
         """
-        return self._of(self._received(data), holder_salt=holder_salt)
+        return self._spanned_anew(self._received(data), holder_salt)
 
     def _received(self, data: bytes) -> SubspaceBatch:
         """Decode a template, and check whether it is one of the contract."""
@@ -300,12 +300,12 @@ class Enroller:
             )
         return subspace
 
-    def _of(self, subspace: SubspaceBatch, *, holder_salt: str | None) -> Enrollment:
+    def _spanned_anew(self, subspace: SubspaceBatch, holder_salt: str | None) -> Enrollment:
         # The client knows its rows. Turned as they are, they would be pairs (x, R x) of the
         # template's rotation for whoever sees them stored; of a fresh basis only the set is known.
         with Keystream.fresh() as stream:
             spanned = SubspaceBatch.through(subspace.foot, subspace.basis, stream=stream)
-        return self._finish(spanned, per_photo=(), photos=0, holder_salt=holder_salt)
+        return self._enrollment(spanned, holder_salt)
 
     def _turned_by_holder(
         self, subspace: SubspaceBatch, holder: Holder | None
@@ -317,22 +317,16 @@ class Enroller:
         rotation = holder_rotation(holder.key, salt, self._contract.binding.axes)
         return subspace.turned_by(rotation.turned), salt
 
-    def _finish(
+    def _enrollment(
         self,
         subspace: SubspaceBatch,
-        *,
-        per_photo: tuple[PhotoResult, ...],
-        photos: int,
         holder_salt: str | None,
+        *,
+        per_photo: tuple[PhotoResult, ...] = (),
+        photos: int = 0,
     ) -> Enrollment:
+        """Turn a template by a rotation of the tenant's, and encode it."""
         contract_id, template_id = self._contract.contract_id, secrets.token_hex(16)
-        rotation = self._rotation.of(template_id)
-        turned = subspace.turned_by(rotation.turned)
-        return Enrollment(
-            wire=wire.encode(turned, contract_id=contract_id, dtype=WIRE_DTYPE),
-            template_id=template_id,
-            contract_id=contract_id,
-            per_photo=per_photo,
-            photos=photos,
-            holder_salt=holder_salt,
-        )
+        turned = subspace.turned_by(self._rotation.of(template_id).turned)
+        data = wire.encode(turned, contract_id=contract_id, dtype=WIRE_DTYPE)
+        return Enrollment(data, template_id, contract_id, per_photo, photos, holder_salt)

@@ -71,7 +71,7 @@ def through_wire(batch: SubspaceBatch, *, contract_id: str) -> SubspaceBatch:
     feet, bases = np.empty_like(batch.feet), np.empty_like(batch.bases)
     for row, template in enumerate(batch):
         data = wire.encode(template, contract_id=contract_id, dtype=WIRE_DTYPE)
-        back = wire.decode(data, max_n=batch.n, max_m=batch.m).subspace
+        back = wire.decode(data).subspace
         feet[row], bases[row] = back.foot, back.basis
     return SubspaceBatch(feet, bases)
 

@@ -249,7 +249,7 @@ class Runtime(Deployment):
         binding = self.contract.binding
         contract_id = self.contract.contract_id
         binding.require_contract(template.record.contract_id, what="the stored template")
-        stored = wire.decode(template.wire, max_n=binding.axes, max_m=binding.m)
+        stored = wire.decode(template.wire)
         rotation = in_rotation.rotation.of(template.template_id)
         plain = stored.subspace.turned_by(rotation.turned_back)
         exported = Exported(

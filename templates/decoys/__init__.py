@@ -4,8 +4,7 @@ A source is either a secret pool of real descriptors or a generator of descripto
 """
 
 from templates.decoys.generator import DecoyGenerator
-from templates.decoys.loading import client_source, load_source
-from templates.decoys.pool import DecoyPool
+from templates.decoys.pool import DecoyPool, client_source, load_source
 from templates.decoys.source import Attributes, DecoySource
 
 __all__ = [

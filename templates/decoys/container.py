@@ -1,4 +1,4 @@
-"""The byte form of decoy sources: safetensors with one canonical encoding, decoded strictly.
+"""The files of decoy sources: safetensors with one canonical encoding, decoded strictly.
 
 A safetensors file may order its tensors, pad its header and carry foreign metadata as it likes.
 Here one content has one encoding, so that its hash can name it: the decoder re-encodes what it
@@ -6,7 +6,9 @@ read and refuses anything that does not come out byte for byte the same.
 """
 
 import json
+import os
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 import safetensors
@@ -14,6 +16,7 @@ from numpy.typing import NDArray
 from safetensors.numpy import load, save
 
 from templates.errors import DecoyError
+from templates.keys.private_file import read_at_most, replace_private
 
 METADATA_KEY = "veilface"
 # The writer keeps metadata in an unordered map: a second key would make the bytes vary by run.
@@ -98,3 +101,38 @@ def decode(
     if not canonical:
         raise DecoyError(f"the {what} is not in its canonical encoding; write it again")
     return fields, arrays
+
+
+def write_private(path: Path, data: bytes) -> None:
+    """Replace `path` at once by a file of mode 0600; see `replace_private`.
+
+    Raises
+    ------
+    DecoyError
+        The file cannot be written.
+    """
+    try:
+        replace_private(path, data)
+    except OSError as error:
+        raise DecoyError(f"cannot write {path.name}: {error.strerror}") from error
+
+
+def read_bounded(path: Path, limit: int) -> bytes:
+    """Read a file of at most `limit` bytes.
+
+    Raises
+    ------
+    DecoyError
+        The file cannot be read or is larger.
+    """
+    try:
+        with path.open("rb") as file:
+            size = os.fstat(file.fileno()).st_size
+            if size > limit:
+                raise DecoyError(f"{path.name} has {size} bytes; at most {limit} are accepted")
+            data = read_at_most(file, limit)
+    except OSError as error:
+        raise DecoyError(f"cannot read {path.name}: {error.strerror}") from error
+    if len(data) > limit:
+        raise DecoyError(f"{path.name} is larger than {limit} bytes")
+    return data

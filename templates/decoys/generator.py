@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from templates.decoys import container
-from templates.decoys.files import read_bounded, write_private
 from templates.decoys.fitting import Moments, adapted_moments, fit_moments
 from templates.decoys.source import MAX_DIMENSION, Attributes, checked_made_with, take_made_with
 from templates.errors import DecoyError, InvalidEmbedding
@@ -309,7 +308,7 @@ class DecoyGenerator:
         DecoyError
             The file cannot be written.
         """
-        write_private(path, self.to_bytes())
+        container.write_private(path, self.to_bytes())
 
     @classmethod
     def load(cls, path: Path) -> Self:
@@ -320,7 +319,7 @@ class DecoyGenerator:
         DecoyError
             The file cannot be read or is no decoy generator.
         """
-        return cls.from_bytes(read_bounded(path, MAX_GENERATOR_BYTES))
+        return cls.from_bytes(container.read_bounded(path, MAX_GENERATOR_BYTES))
 
     def _check(self) -> None:
         n, k = self.axes.shape if self.axes.ndim == 2 else (0, 0)

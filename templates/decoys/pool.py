@@ -16,10 +16,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from templates.decoys import container
-from templates.decoys.files import read_bounded, write_private
 from templates.decoys.fitting import MIN_DESCRIPTORS
 from templates.decoys.generator import DecoyGenerator
-from templates.decoys.source import MAX_DIMENSION, Attributes, checked_made_with, take_made_with
+from templates.decoys.source import (
+    MAX_DIMENSION,
+    Attributes,
+    DecoySource,
+    checked_made_with,
+    take_made_with,
+)
 from templates.errors import DecoyError
 from templates.keys.randomness import Keystream
 from templates.keys.sealing import Sealer
@@ -296,7 +301,9 @@ class DecoyPool:
         DecoyError
             The file cannot be written.
         """
-        write_private(path, POOL_MAGIC + sealer.seal(self._encode(), context=POOL_CONTEXT))
+        container.write_private(
+            path, POOL_MAGIC + sealer.seal(self._encode(), context=POOL_CONTEXT)
+        )
 
     @classmethod
     def load(cls, path: Path, sealer: Sealer) -> Self:
@@ -309,7 +316,7 @@ class DecoyPool:
         SealError
             The sealer's key does not open it.
         """
-        data = read_bounded(path, MAX_POOL_BYTES)
+        data = container.read_bounded(path, MAX_POOL_BYTES)
         if not data.startswith(POOL_MAGIC):
             raise DecoyError(f"{path.name} is not a decoy pool")
         return cls._decode(sealer.open(data[len(POOL_MAGIC) :], context=POOL_CONTEXT))
@@ -356,3 +363,38 @@ def _coded(values: list[str | None]) -> tuple[list[str], NDArray[np.uint8]]:
     place: dict[str | None, int] = {name: i for i, name in enumerate(names)}
     place[None] = _UNKNOWN
     return names, np.array([place[value] for value in values], dtype=np.uint8)
+
+
+def load_source(path: Path, sealer: Sealer) -> DecoyPool | DecoyGenerator:
+    """Load a sealed pool or a plain generator, told apart by the first bytes of the file.
+
+    Raises
+    ------
+    DecoyError
+        The file cannot be read, or is neither.
+    SealError
+        It is a pool that the sealer's key does not open.
+    """
+    try:
+        with path.open("rb") as file:
+            start = file.read(len(POOL_MAGIC))
+    except OSError as error:
+        raise DecoyError(f"cannot read {path.name}: {error.strerror}") from error
+    return DecoyPool.load(path, sealer) if start == POOL_MAGIC else DecoyGenerator.load(path)
+
+
+def client_source(source: DecoySource) -> DecoyGenerator:
+    """Return the generator that lifting clients receive, never a pool.
+
+    A generator is returned as it is; to a pool one is fitted, always the same for the same pool.
+
+    Raises
+    ------
+    DecoyError
+        It is neither.
+    """
+    if isinstance(source, DecoyPool):
+        return source.fitted
+    if not isinstance(source, DecoyGenerator):
+        raise DecoyError("clients lift with a decoy generator, and this source is another kind")
+    return source

@@ -149,11 +149,6 @@ class ApiKeys:
         """
         return self._valid(self._row(prefix))
 
-    def get(self, prefix: str) -> ApiKey | None:
-        """Return a key by its prefix, or None."""
-        row = self._row(prefix)
-        return None if row is None else self._read(row)
-
     def all(self, *, tenant: str | None = None) -> tuple[ApiKey, ...]:
         """Every key, or every key of a tenant, the oldest first."""
         query = _KEYS.order_by(ApiKeyRow.created_at, ApiKeyRow.prefix)

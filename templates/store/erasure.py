@@ -11,6 +11,8 @@ from templates.store.audit_log import PROGRAM, TENANT_ERASE, By, Entry
 from templates.store.context import StoreContext
 from templates.store.identifiers import UnknownTenant, checked_subject_id, checked_tenant_name
 from templates.store.receipts import (
+    SUBJECT_KIND,
+    TENANT_KIND,
     Receipt,
     keep_receipt,
     latest_receipt,
@@ -139,8 +141,10 @@ class Erasures:
             subjects = _delete(connection, SubjectRow, SubjectRow.id == subject_pk)
             outcome, now = "erased" if subjects else "nothing_held", self._context.clock()
             receipt = self._context.signer.sign(
+                SUBJECT_KIND,
                 tenant=tenant,
-                pseudonym=pseudonym,
+                subject=pseudonym,
+                held=contract_id is not None,
                 contract_id=contract_id,
                 # The data key is a column of the subject's row, with the metadata.
                 erased={
@@ -167,8 +171,13 @@ class Erasures:
         erased = _counts(connection, owner.id)
         # Everything else of the tenant goes with its row, by the foreign keys.
         _delete(connection, TenantRow, TenantRow.id == owner.id)
-        receipt = self._context.signer.sign_tenant(
-            tenant=tenant, rotation_epoch=owner.rotation_epoch, erased=erased, erased_at=now
+        receipt = self._context.signer.sign(
+            TENANT_KIND,
+            tenant=tenant,
+            held=True,
+            rotation_epoch=owner.rotation_epoch,
+            erased=erased,
+            erased_at=now,
         )
         keep_receipt(connection, name, receipt, now)
         self._context.audit_log.append(

@@ -98,49 +98,19 @@ class ReceiptSigner:
         return public_key_of(self._secrets.get(SecretName.RECEIPT))
 
     def sign(
-        self,
-        *,
-        tenant: str,
-        pseudonym: str,
-        contract_id: str | None,
-        erased: Mapping[str, int],
-        erased_at: datetime,
+        self, kind: str, *, erased: Mapping[str, int], erased_at: datetime, **claims: Any
     ) -> Receipt:
-        """Write and sign the receipt of a subject, with a random id of its own.
+        """Write and sign a receipt, with a random id of its own.
 
         Parameters
         ----------
-        contract_id
-            Contract of the template; None where nothing was held.
+        kind
+            :data:`SUBJECT_KIND` or :data:`TENANT_KIND`.
         erased
             Number of records of each kind that went.
+        claims
+            What :class:`Receipt` lists beside these.
         """
-        return self._signed(
-            SUBJECT_KIND,
-            erased,
-            erased_at,
-            tenant=tenant,
-            subject=pseudonym,
-            held=contract_id is not None,
-            contract_id=contract_id,
-        )
-
-    def sign_tenant(
-        self, *, tenant: str, rotation_epoch: int, erased: Mapping[str, int], erased_at: datetime
-    ) -> Receipt:
-        """Write and sign the receipt of a tenant, with a random id of its own."""
-        return self._signed(
-            TENANT_KIND,
-            erased,
-            erased_at,
-            tenant=tenant,
-            held=True,
-            rotation_epoch=rotation_epoch,
-        )
-
-    def _signed(
-        self, kind: str, erased: Mapping[str, int], erased_at: datetime, **claims: Any
-    ) -> Receipt:
         body = {
             "kind": kind,
             "version": _VERSION,

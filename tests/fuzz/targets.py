@@ -94,7 +94,7 @@ def template(folder: Path) -> Target:
             received.subspace, contract_id=received.contract_id, dtype=received.dtype
         )
         wire.decode(again)
-        demand(len(again) <= wire.size_limit(4096, 128), "no larger than the limit")
+        demand(len(again) <= wire.MAX_BYTES, "no larger than the limit")
 
     return Target(read, (InvalidTemplate,), Templates().make, 64, regressions.templates())
 
@@ -199,7 +199,7 @@ def contract(folder: Path) -> Target:
 
 def decoys(folder: Path) -> Target:
     """``templates.decoys``: generators that anybody may send, and sealed pools."""
-    from templates.decoys.loading import load_source
+    from templates.decoys import load_source
     from templates.errors import DecoyError, SealError
     from templates.keys.randomness import Keystream
     from tests.fuzz.tensors import SEALER, Decoys

@@ -22,7 +22,7 @@ from templates.store import TemplateStore
 from templates.store.audit_log import Line
 from templates.store.receipts import Receipt, verify_receipt
 from templates.store.schema import ReceiptRow, SubjectRow, TemplateRow
-from tests.api.deployment import Deployment, M, N
+from tests.api.deployment import Deployment
 from tests.reliability.operations import Operation
 
 DECIDED = ("accept", "reject")
@@ -279,7 +279,7 @@ class _Examination:
             elif stored is not None and last is not None:
                 if last.answered_well and stored.record.template_id != last.template_id:
                     self._wrong(f"{subject}: another template than that of {last}")
-                wire.decode(stored.wire, max_n=N, max_m=M)
+                wire.decode(stored.wire)
         enrolled, erased = False, False
         for line in self._lines_of(subject):
             if line.action == "enroll":

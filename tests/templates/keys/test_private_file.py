@@ -2,6 +2,7 @@
 
 import os
 import stat
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import pytest
 
 from templates.keys.private_file import (
     create_private,
+    read_at_most,
     replace_private,
     replace_public,
 )
@@ -101,3 +103,33 @@ def test_a_write_that_fails_leaves_the_old_file_and_no_other(
         assert failed.value.filename == str(path)
         assert [each.name for each in tmp_path.iterdir()] == ["out"]
         assert path.read_bytes() == b"before"
+
+
+@pytest.mark.parametrize(("size", "most"), [(10, 10), (11, 10), (5 * 2**20, 2**20), (5, 0)])
+def test_one_byte_more_than_the_limit_tells_of_a_larger_file(
+    tmp_path: Path, size: int, most: int
+) -> None:
+    content = os.urandom(size)
+    (tmp_path / "file").write_bytes(content)
+    with (tmp_path / "file").open("rb") as file:
+        assert read_at_most(file, most) == content[: most + 1]
+
+
+@pytest.mark.parametrize(("size", "most"), [(3 * 2**20, 2**30), (3 * 2**20, 2**20), (0, 5)])
+def test_a_pipe_which_has_no_size_is_read_as_well(size: int, most: int) -> None:
+    content = os.urandom(size)
+    reading, writing = os.pipe()
+
+    def write() -> None:
+        with os.fdopen(writing, "wb") as file:
+            try:
+                file.write(content)
+                file.flush()
+            except BrokenPipeError:
+                pass
+
+    thread = threading.Thread(target=write)
+    thread.start()
+    with os.fdopen(reading, "rb") as file:
+        assert read_at_most(file, most) == content[: most + 1]
+    thread.join()

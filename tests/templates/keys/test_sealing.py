@@ -329,17 +329,6 @@ def lines_of(*keys: bytes) -> str:
     return "".join(base64.b64encode(key).decode() + "\n" for key in keys)
 
 
-BAD_TEXTS = [
-    ("", "holds no key"),
-    ("not-base64!", "not base64"),
-    (lines_of(KEY[:31]), "31 bytes"),
-    (lines_of(bytes(32)), "pattern"),
-    (lines_of(b"correct horse battery staple 32!"), "readable text"),
-    (lines_of(KEY, KEY), "same key twice"),
-    (lines_of(KEY, bytes(range(32))), "key 2"),
-]
-
-
 @pytest.mark.parametrize("separator", ["\n", " ", ",", ", "])
 def test_keys_come_from_the_environment(monkeypatch: pytest.MonkeyPatch, separator: str) -> None:
     encoded = lines_of(KEY, OTHER).split()
@@ -350,7 +339,10 @@ def test_keys_come_from_the_environment(monkeypatch: pytest.MonkeyPatch, separat
     assert keyring.open(sealed, purpose="p", bound_to=[]) == b"text"
 
 
-@pytest.mark.parametrize(("text", "message"), BAD_TEXTS)
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [("", "holds no key"), (lines_of(KEY, bytes(range(32))), "key 2 .* pattern")],
+)
 def test_bad_keys_in_the_environment_are_refused(
     monkeypatch: pytest.MonkeyPatch, text: str, message: str
 ) -> None:

@@ -44,11 +44,6 @@ def test_every_split_is_looked_at(count: int, seed: int) -> None:
     assert len(found.apart) <= len(found.others)
 
 
-def test_two_photos_agree_by_their_cosine() -> None:
-    rows = unit(np.random.default_rng(0).normal(size=(2, 12)))
-    assert weakest_split(rows).agreement == pytest.approx(float(rows[0] @ rows[1]), abs=1e-6)
-
-
 def test_photos_that_cancel_do_not_divide_by_nothing() -> None:
     row = np.eye(8)[0]
     assert np.isfinite(weakest_split(np.stack([row, -row, np.eye(8)[1]])).agreement)
