@@ -38,11 +38,7 @@ export function headMovements() {
       await after(READY_MS);
       signal.throwIfAborted();
       // Asked for now: its minute has begun.
-      const challenge = await call("POST", "/v1/challenges", {
-        body: JSON.stringify({ subject_id: subject }),
-        headers: { "Content-Type": "application/json" },
-        signal,
-      });
+      const challenge = await call("POST", "/v1/challenges", { json: { subject_id: subject }, signal });
       const photos = [await snap(signal)];
       for (const asked of challenge.movements) {
         say(asked);

@@ -145,7 +145,6 @@ export function photoForm(id, view) {
     offNote(why),
     form,
   );
-  holder.fold(fields.querySelector("details"));
   if (replaces) subject.input.addEventListener("input", clear);
   picker?.dropOn(form);
   picker?.start();

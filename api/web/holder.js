@@ -54,7 +54,6 @@ export function holderKey(action, subject, onchange) {
       onchange();
     },
   });
-  let details = null;
   // Another attempt to enroll takes the same passkey.
   let made = null;
   let known = null;
@@ -62,7 +61,8 @@ export function holderKey(action, subject, onchange) {
   function choose(value) {
     source.choose(value);
     panel.replaceChildren(...panels[value]);
-    if (value !== "none") details.open = true;
+    // What is chosen by itself is not left folded away.
+    if (value !== "none") panel.closest("details")?.setAttribute("open", "");
   }
 
   async function fromPasskey(id) {
@@ -109,7 +109,7 @@ export function holderKey(action, subject, onchange) {
     start();
   }
   const parts = [source.root, off ? h("p", { class: "hint", id: offId }, off) : null, lock, panel];
-  return { parts, key, fold: (node) => (details = node), stop: () => ended.abort() };
+  return { parts, key, stop: () => ended.abort() };
 }
 
 function fileMaker(subject) {

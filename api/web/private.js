@@ -115,10 +115,7 @@ function dropFailed() {
   if (prepared?.failed) prepared = null;
 }
 
-async function token(asked, signal) {
-  const headers = { "Content-Type": "application/json" };
-  return (await call("POST", "/v1/tokens", { body: JSON.stringify(asked), signal, headers })).token;
-}
+const token = async (json, signal) => (await call("POST", "/v1/tokens", { json, signal })).token;
 
 function ready() {
   const until = untilSignedOut();

@@ -55,7 +55,9 @@ export class Problem extends Error {
   }
 }
 
-export async function call(method, path, { body, headers, signal } = {}) {
+// `json` is sent as a JSON body, in the place of `body`.
+export async function call(method, path, { json, body, headers, signal } = {}) {
+  if (json) [body, headers] = [JSON.stringify(json), { "Content-Type": "application/json", ...headers }];
   const used = key;
   const ended = AbortSignal.any([running.signal, ...(signal ? [signal] : [])]);
   let answer;
