@@ -29,7 +29,7 @@ from api.http.errors import StartError
 from api.http.receipts import read_receipt_key, verify_answer
 from api.http.routes.drawn_people import ENROLLED_PHOTOS, PROBE_PHOTOS
 from api.service.opening import file_sealer
-from api.service.settings_file import settings_text
+from api.service.settings_file import Value, settings_text
 from models.demo import build_demo_pack, is_demo_model
 from models.extraction import Extraction, Extractor
 from models.pack import ModelPack
@@ -215,7 +215,7 @@ def _extract(pack: ModelPack, photos: Sequence[Path]) -> Extraction:
 
 
 def _write_settings(folder: Path, pack: Path) -> None:
-    values: dict[str, Path | bool] = {
+    values: dict[str, Value] = {
         "data_dir": folder,
         "master_key_file": folder / KEY_FILE,
         "pack": pack,

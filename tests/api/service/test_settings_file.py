@@ -14,7 +14,14 @@ from api.service.settings_file import settings_text
 def test_any_path_is_read_back_in_full(name: str, tmp_path: Path) -> None:
     folder = tmp_path / name
     text = settings_text(
-        {"data_dir": folder, "demo": True, "web_page": False, "providers": ("cuda", "cpu")}, "Ours."
+        {
+            "data_dir": folder,
+            "demo": True,
+            "web_page": False,
+            "providers": ("cuda", "cpu"),
+            "database_url": f"sqlite:///{name}",
+        },
+        "Ours.",
     )
     assert text.startswith("# Ours.\n")
     assert tomllib.loads(text) == {
@@ -22,6 +29,7 @@ def test_any_path_is_read_back_in_full(name: str, tmp_path: Path) -> None:
         "demo": True,
         "web_page": False,
         "providers": ["cuda", "cpu"],
+        "database_url": f"sqlite:///{name}",
     }
 
 
