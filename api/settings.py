@@ -31,6 +31,8 @@ ENV_PREFIX = "VEILFACE_"
 CONFIG_VARIABLE = "VEILFACE_CONFIG"
 DEFAULT_CONFIG_FILE = Path("veilface.toml")
 MIB = 1024 * 1024
+DEFAULT_TENANT = "default"
+"""Of the key that `veilface setup` makes, and of commands that name none."""
 OFF = "off"
 NONE = NO_PROXIES = "none"
 MAX_ONNX_THREADS = 256
@@ -250,9 +252,6 @@ class Settings(BaseSettings):
     max_request_bytes: int = Field(
         32 * MIB, ge=1024, le=1024 * MIB, description="Largest request body, in bytes."
     )
-    body_timeout_s: float = Field(
-        60.0, gt=0, le=3600, description="Seconds that a request body may take to arrive."
-    )
     max_image_bytes: int = Field(
         10 * MIB, ge=1024, le=256 * MIB, description="Largest photo, in bytes as sent."
     )
@@ -262,17 +261,6 @@ class Settings(BaseSettings):
         le=400_000_000,
         description="Largest photo, in pixels; checked before decoding, which takes up to 17 "
         "bytes a pixel.",
-    )
-    max_images: int = Field(
-        10,
-        ge=1,
-        le=10,
-        description="Maximum number of photos per enrollment; a verification takes five at most.",
-    )
-    default_tenant: str = Field(
-        "default",
-        pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$",
-        description="Tenant of the bootstrap key and of commands that name none.",
     )
     export_key_file: Path | None = Field(
         None,
@@ -296,9 +284,10 @@ class Settings(BaseSettings):
         description="Path under which a proxy shows the service, such as `/faces` "
         "(docs/deploy.md). The proxy may pass it on or take it away.",
     )
-    web_page: bool = Field(True, description="Serve the web page at `/` (docs/javascript.md).")
-    api_docs: bool = Field(
-        True, description="Serve the reference of the API at `/docs`, for whoever reaches it."
+    web_page: bool = Field(
+        True,
+        description="Serve the web page at `/` (docs/javascript.md), and the reference of the API "
+        "at `/docs`; neither needs a key.",
     )
     serve_pack: bool = Field(
         False,

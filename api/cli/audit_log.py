@@ -17,7 +17,7 @@ from api.cli.results import Result, reports
 from api.http.audit import operator
 from api.http.schemas import iso_time
 from api.service.opening import checked_store
-from api.settings import Settings
+from api.settings import DEFAULT_TENANT, Settings
 from templates.store import TemplateStore
 from templates.store.audit_archive import Archive, verify_archive
 from templates.store.audit_chain import Anchor, BrokenAuditLog
@@ -151,7 +151,7 @@ def head(*, settings: Settings) -> Result:
 
 
 @app.command()
-@takes_settings(*STORE, "default_tenant")
+@takes_settings(*STORE)
 def show(
     *,
     settings: Settings,
@@ -170,7 +170,7 @@ def show(
     Example: `veilface audit-log show --subject alice --limit 100`
     """
     with checked_store(settings) as store:
-        name = tenant or (settings.default_tenant if subject is not None else None)
+        name = tenant or (DEFAULT_TENANT if subject is not None else None)
         pseudonym = None if subject is None else store.signer.pseudonym(str(name), subject)
         lines = store.audit_log.lines(after=after)
         if name is not None:

@@ -13,7 +13,7 @@ from api.cli.results import Result, reports
 from api.http.audit import operator
 from api.http.receipts import receipt_json
 from api.service.opening import checked_store, open_keyring, open_store, retention_of
-from api.settings import Settings
+from api.settings import DEFAULT_TENANT, Settings
 from templates.errors import VeilfaceError
 from templates.keys.private_file import replace_private
 from templates.store.database import Database
@@ -109,12 +109,12 @@ def compact(*, settings: Settings) -> Result:
 
 
 @app.command()
-@reports(*STORE, "default_tenant")
+@reports(*STORE)
 def unlock(
     subject: Annotated[str, typer.Argument(help="Subject to unlock.")],
     *,
     settings: Settings,
-    tenant: Tenant = None,
+    tenant: Tenant = DEFAULT_TENANT,
 ) -> Result:
     """Clear the failed attempts of a subject; exit status 1 if there are none.
 
@@ -123,10 +123,9 @@ def unlock(
 
     Example: `veilface db unlock alice --tenant default`
     """
-    name = tenant or settings.default_tenant
     with checked_store(settings) as store:
-        lifted = store.attempts.reset(name, subject, by=operator())
-    facts = {"subject_id": subject, "tenant": name, "lifted": lifted}
+        lifted = store.attempts.reset(tenant, subject, by=operator())
+    facts = {"subject_id": subject, "tenant": tenant, "lifted": lifted}
     if not lifted:
         return Result(facts, error="this subject has no failed attempts")
     return Result(facts, f"Cleared the failed attempts of {subject}.")
@@ -165,11 +164,11 @@ def purge(
 
 
 @app.command("template-enrollment")
-@reports(*STORE, "default_tenant")
+@reports(*STORE)
 def template_enrollment(
     *,
     settings: Settings,
-    tenant: Tenant = None,
+    tenant: Tenant = DEFAULT_TENANT,
     allow: Annotated[
         bool | None,
         typer.Option(
@@ -186,14 +185,13 @@ def template_enrollment(
 
     Example: `veilface db template-enrollment --tenant default --allow`
     """
-    name = tenant or settings.default_tenant
     with checked_store(settings) as store:
         if allow is not None:
-            store.tenants.set_template_enrollment(name, allow, by=operator())
-        allowed = store.tenants.get(name).template_enrollment
+            store.tenants.set_template_enrollment(tenant, allow, by=operator())
+        allowed = store.tenants.get(tenant).template_enrollment
     return Result(
-        {"tenant": name, "template_enrollment": allowed},
-        f"Tenant {name} {'takes' if allowed else 'does not take'} templates that clients made.",
+        {"tenant": tenant, "template_enrollment": allowed},
+        f"Tenant {tenant} {'takes' if allowed else 'does not take'} templates that clients made.",
     )
 
 

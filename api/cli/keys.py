@@ -18,7 +18,7 @@ from api.cli.results import Result, Table, reports
 from api.http.audit import operator
 from api.http.receipts import verify_answer
 from api.service.opening import open_contract, open_keyring
-from api.settings import Settings
+from api.settings import DEFAULT_TENANT, Settings
 from templates.contract.canonical import parse_object
 from templates.errors import StoreError
 from templates.keys.private_file import create_private
@@ -53,7 +53,7 @@ for _command in (
 
 
 @app.command()
-@reports(*STORE, "default_tenant")
+@reports(*STORE)
 def create(
     *,
     settings: Settings,
@@ -61,10 +61,7 @@ def create(
         list[Right],
         typer.Option(help="A right of the key; repeat for several."),
     ],
-    tenant: Annotated[
-        str | None,
-        typer.Option(help="Tenant, created if it is new. Unset: the setting `default_tenant`."),
-    ] = None,
+    tenant: Annotated[str, typer.Option(help="Tenant, created if it is new.")] = DEFAULT_TENANT,
     label: Annotated[str, typer.Option(help="What the key is for, as `list` shows it.")] = "",
     days: Annotated[
         int | None,
@@ -86,15 +83,14 @@ def create(
 
     Example: `veilface keys create --right enroll --right verify --label web-shop`
     """
-    name = tenant or settings.default_tenant
     _require_new(out)
     with opened_store(settings) as store:
-        store.tenants.create(name)
+        store.tenants.create(tenant)
         expires = None if days is None else utc_now() + timedelta(days=days)
         made = store.api_keys.create(
-            name, right, label=label, expires_at=expires, lowest_level=lowest_level, by=operator()
+            tenant, right, label=label, expires_at=expires, lowest_level=lowest_level, by=operator()
         )
-    return _shown_once(made, f"Key {made.key.prefix} of tenant {name}", out)
+    return _shown_once(made, f"Key {made.key.prefix} of tenant {tenant}", out)
 
 
 @app.command("list")
@@ -200,11 +196,11 @@ def _shown_once(made: NewApiKey, what: str, out: Path | None, **facts: str) -> R
 
 
 @app.command("rotate-tenant")
-@reports(*FILES, "default_tenant")
+@reports(*FILES)
 def rotate_tenant(
     *,
     settings: Settings,
-    tenant: Tenant = None,
+    tenant: Tenant = DEFAULT_TENANT,
     stolen: Annotated[
         bool,
         typer.Option(
@@ -230,32 +226,31 @@ def rotate_tenant(
 
     Example: `veilface keys rotate-tenant --tenant default`
     """
-    name = tenant or settings.default_tenant
     keyring = open_keyring(settings)
     binding = None if stolen else open_contract(settings, keyring).binding
     with opened_store(settings, keyring) as store:
         rotations = store.rerotation
-        epoch = store.tenants.get(name).rotation_epoch
+        epoch = store.tenants.get(tenant).rotation_epoch
         if not finish:
-            epoch = rotations.begin(name, by=operator())
+            epoch = rotations.begin(tenant, by=operator())
         moved = 0
         if binding is not None:
-            with progress("turning templates", rotations.remaining(name)) as advance:
-                moved = rotations.move(name, binding, by=operator(), progress=advance)
-        left = list(rotations.subjects_of_old_epochs(name))
-        dropped = 0 if left else rotations.retire(name, by=operator())
-    text = [f"Tenant {name} is in rotation epoch {epoch}; {moved} templates were turned into it."]
+            with progress("turning templates", rotations.remaining(tenant)) as advance:
+                moved = rotations.move(tenant, binding, by=operator(), progress=advance)
+        left = list(rotations.subjects_of_old_epochs(tenant))
+        dropped = 0 if left else rotations.retire(tenant, by=operator())
+    text = [f"Tenant {tenant} is in rotation epoch {epoch}; {moved} templates were turned into it."]
     if left:
         text += [
             f"{len(left)} subjects keep an older rotation until they are enrolled again:",
             *(f"  {subject}" for subject in left),
-            f"Then run `veilface keys rotate-tenant --tenant {name} --stolen --finish`.",
+            f"Then run `veilface keys rotate-tenant --tenant {tenant} --stolen --finish`.",
         ]
     elif dropped:
         text.append(f"Dropped the keys of {dropped} older epochs.")
     return Result(
         {
-            "tenant": name,
+            "tenant": tenant,
             "rotation_epoch": epoch,
             "moved": moved,
             "enroll_again": left,

@@ -33,10 +33,7 @@ LOCAL = (*STORE, "contract_file", "decoys_file", "pack", "providers", "onnx_thre
 AsJson = Annotated[
     bool, typer.Option("--json", help="Write JSON to stdout; messages stay on stderr.")
 ]
-Tenant = Annotated[
-    str | None,
-    typer.Option(help="Tenant. Unset: the setting `default_tenant`."),
-]
+Tenant = Annotated[str, typer.Option(help="Tenant.")]
 
 Device = Annotated[
     str,

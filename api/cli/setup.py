@@ -31,7 +31,7 @@ from api.cli.verdict import plain_lines
 from api.http.audit import operator
 from api.service.opening import file_sealer, open_contract, open_keyring
 from api.service.settings_file import settings_text
-from api.settings import DEFAULT_CONFIG_FILE, Settings, config_file, load_settings
+from api.settings import DEFAULT_CONFIG_FILE, DEFAULT_TENANT, Settings, config_file, load_settings
 from models.extraction import Extraction
 from models.pack import ModelPack
 from templates.contract.document import Contract
@@ -357,8 +357,8 @@ def _keep_api_key(settings: Settings, keyring: MasterKeyring, steps: dict[str, s
         steps["API key"] = "made"
         why = f"the store does not take the one of {file}: making another" if is_there else ""
         message(f"... API key: {why or f'making {file}'}")
-        store.tenants.create(settings.default_tenant)
-        new = store.api_keys.create(settings.default_tenant, RIGHTS, label="setup", by=operator())
+        store.tenants.create(DEFAULT_TENANT)
+        new = store.api_keys.create(DEFAULT_TENANT, RIGHTS, label="setup", by=operator())
         write = replace_private if is_there else create_private
         write(file, f"{new.token}\n".encode())
 

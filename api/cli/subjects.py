@@ -18,7 +18,7 @@ from api.http.audit import operator
 from api.http.errors import ApiError
 from api.service.opening import weak_privacy
 from api.service.runtime import Runtime
-from api.settings import Settings
+from api.settings import DEFAULT_TENANT, Settings
 from enroll import Enrollment
 from enroll.enroller import MAX_PHOTOS, Holder
 from models.errors import PhotoRejected
@@ -82,7 +82,7 @@ def enroll(
         str | None,
         typer.Option(help="For a hybrid+ contract: used for lifting, never stored."),
     ] = None,
-    tenant: Tenant = None,
+    tenant: Tenant = DEFAULT_TENANT,
     face: Face = FacePolicy.SINGLE,
     holder_key_file: HolderKeyFile = None,
     new_holder_key_file: Annotated[
@@ -273,7 +273,7 @@ def verify(
             "default."
         ),
     ] = None,
-    tenant: Tenant = None,
+    tenant: Tenant = DEFAULT_TENANT,
     face: Face = FacePolicy.SINGLE,
     holder_key_file: HolderKeyFile = None,
 ) -> Result:
@@ -345,7 +345,7 @@ def _named(photos: Sequence[Path]) -> Iterator[None]:
 
 
 @contextmanager
-def _opened(settings: Settings, tenant: str | None) -> Iterator[_Entrance]:
+def _opened(settings: Settings, tenant: str) -> Iterator[_Entrance]:
     """Open the deployment.
 
     Only the default tenant is made where it is missing.
@@ -354,8 +354,8 @@ def _opened(settings: Settings, tenant: str | None) -> Iterator[_Entrance]:
     try:
         if runtime.pack is None:
             raise UsageError("photos need a model pack; name it with --pack")
-        tenants, name = runtime.store.tenants, tenant or settings.default_tenant
-        known = tenants.create(name) if name == settings.default_tenant else tenants.get(name)
+        tenants = runtime.store.tenants
+        known = tenants.create(tenant) if tenant == DEFAULT_TENANT else tenants.get(tenant)
         yield _Entrance(runtime, runtime.pack, known.name)
     finally:
         runtime.close()

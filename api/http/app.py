@@ -139,10 +139,9 @@ def create_app(
     routes += document_routes(_document(), root_path=settings.root_path)
     if settings.web_page:
         routes += page_routes(demo=settings.demo, serve_pack=settings.serve_pack)
+        routes += reference_routes()
     if settings.web_page and settings.demo:
         routes += drawn_people_routes()
-    if settings.api_docs:
-        routes += reference_routes()
     _add_middleware(app, settings)
     return app
 

@@ -28,6 +28,8 @@ _FORM, _JSON = "multipart/form-data", "application/json"
 _MEDIA_TYPE = re.compile(r"[a-z0-9.+-]{1,63}/[a-z0-9.+-]{1,63}")
 MAX_FIELD_BYTES = 4096
 MAX_FIELDS = 16
+BODY_TIMEOUT_S = 60.0
+"""Seconds that a body may take to arrive."""
 MAX_JSON_PARTS = 24_576
 """Values in a JSON body, counted before it is parsed: six of the longest embeddings, where no
 request has more than five. Without it 4 MiB of small objects take 120 MiB."""
@@ -137,7 +139,7 @@ async def read_form(
         ``malformed_request``, ``validation_failed`` or one of the 413 codes.
     """
     _require_type(request, _FORM, how_to_send(photos))
-    with _arrives_within(settings.body_timeout_s):
+    with _arrives_within(BODY_TIMEOUT_S):
         try:
             form = await _InMemoryParser(request, settings, most).parse()
         except (MultiPartException, UnicodeError, ValueError):
@@ -187,7 +189,7 @@ async def read_json(
     if photos is not None:
         how = f"{how_to_send(photos)}, and what is no photo as application/json"
     _require_type(request, _JSON, how)
-    with _arrives_within(settings.body_timeout_s):
+    with _arrives_within(BODY_TIMEOUT_S):
         body = await read_limited(request, min(settings.max_request_bytes, MAX_JSON_BYTES))
     if too_many_parts(body, MAX_JSON_PARTS):
         raise ApiError(

@@ -19,7 +19,7 @@ from api.service.opening import (
     open_store,
     prepare_database,
 )
-from api.settings import ENV_PREFIX, Settings
+from api.settings import DEFAULT_TENANT, ENV_PREFIX, Settings
 from models.pack import ModelPack
 from templates.contract.document import Binding, Calibration, Contract, Level, Rate
 from templates.contract.verdict import Judgement, Verdict
@@ -189,8 +189,8 @@ def deploy(folder: Path, *, database_url: str | None = None, **changes: Any) -> 
     store = open_store(settings, keyring)
     try:
         prepare_database(store)
-        store.tenants.create(settings.default_tenant)
-        first = store.api_keys.create(settings.default_tenant, tuple(Right))
+        store.tenants.create(DEFAULT_TENANT)
+        first = store.api_keys.create(DEFAULT_TENANT, tuple(Right))
     finally:
         store.close()
     return Deployment(settings, first.token, contract, source)

@@ -229,7 +229,7 @@ def body(folder: Path) -> Target:
     from tests.fuzz.bodies import Bodies
 
     runner = asyncio.Runner()
-    settings = load_settings(body_timeout_s=60)
+    settings = load_settings()
 
     def run(reading: Coroutine[Any, Any, Any]) -> Any:
         try:

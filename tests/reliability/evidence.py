@@ -16,6 +16,7 @@ from typing import Any, Protocol
 import sqlalchemy as sa
 
 from api.service.opening import open_keyring, open_store
+from api.settings import DEFAULT_TENANT
 from templates.contract import wire
 from templates.errors import VeilfaceError
 from templates.store import TemplateStore
@@ -138,7 +139,7 @@ class _Examination:
         asked: Asked,
         subjects: Sequence[str],
     ) -> None:
-        self.tenant = deployment.settings.default_tenant
+        self.tenant = DEFAULT_TENANT
         self.store = store
         self.subjects = subjects
         self.history = [each for each in asked.history if each.kind != "contract"]

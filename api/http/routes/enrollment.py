@@ -9,6 +9,7 @@ from api.http.openapi import body_of
 from api.http.requests import EnrollmentForm, EnrollmentJson
 from api.http.schemas import EnrollmentAnswer, Photo
 from enroll import Holder
+from enroll.enroller import MAX_PHOTOS
 from models.quality import Quality
 from templates.keys.holder_key import wipe
 from templates.store.subject_rows import Source
@@ -52,8 +53,9 @@ async def enroll(
         sent: EnrollmentForm | EnrollmentJson
         if is_form(request):
             runtime.required_pack()
-            most = settings.max_images
-            sent = await read_form(request, settings, EnrollmentForm, photos="images", most=most)
+            sent = await read_form(
+                request, settings, EnrollmentForm, photos="images", most=MAX_PHOTOS
+            )
         else:
             sent = await read_json(request, settings, EnrollmentJson, photos="images")
             # After the fields: who only forgot how to send a photo needs no further right.

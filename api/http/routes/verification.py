@@ -133,7 +133,7 @@ async def _sent(call: Call) -> VerifyForm | VerifyJson:
     runtime.required_pack()
     form = await read_form(request, settings, VerifyForm, photos="image", most=MAX_FRAMES)
     answers = form.challenge_id is not None
-    most = MAX_FRAMES if answers else min(MAX_PROBE_PHOTOS, settings.max_images)
+    most = MAX_FRAMES if answers else MAX_PROBE_PHOTOS
     if len(form.photos) > most:
         raise too_many_images(most)
     if answers and len(form.photos) < MIN_FRAMES:

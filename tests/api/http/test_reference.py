@@ -32,7 +32,7 @@ def test_its_policy_lets_nothing_of_another_origin_run(client: Client) -> None:
 
 
 def test_an_operator_switches_it_off(tmp_path: Path) -> None:
-    with Client(create_app(deploy(tmp_path, api_docs=False).settings)) as client:
+    with Client(create_app(deploy(tmp_path, web_page=False).settings)) as client:
         for path in FILES:
             assert_error(client.get(path), 404, "not_found")
 

@@ -14,6 +14,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.types import Message, Receive, Scope, Send
 
+from api.http import bodies
 from api.http.bodies import MAX_FIELD_BYTES, MAX_JSON_PARTS, read_json
 from api.http.context import RequestContext
 from api.http.errors import ApiError
@@ -152,7 +153,9 @@ def test_no_photo_is_ever_written_to_a_file(
     assert made == []
 
 
-def test_a_body_that_does_not_arrive_is_given_up(client: Client, deployment: Deployment) -> None:
+def test_a_body_that_does_not_arrive_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bodies, "BODY_TIMEOUT_S", 0.05)
+
     async def never() -> None:
         async def receive() -> dict[str, object]:
             await anyio.sleep(60)
@@ -160,7 +163,7 @@ def test_a_body_that_does_not_arrive_is_given_up(client: Client, deployment: Dep
 
         request = Request({"type": "http", "headers": JSON}, receive)
         with pytest.raises(ApiError, match="did not arrive") as caught:
-            await read_json(request, load_settings(body_timeout_s=0.05), EnrollmentJson)
+            await read_json(request, load_settings(), EnrollmentJson)
         assert caught.value.code == "malformed_request"
 
     anyio.run(never)
