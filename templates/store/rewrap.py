@@ -5,13 +5,11 @@ subject. It runs in small writes beside a service in use. What a service seals m
 inside of a write, under the key that its key file has then: none appears under the old key later.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
-from sqlalchemy.orm import InstrumentedAttribute
 
 from templates.errors import SealError
 from templates.keys.sealing import sealed_key_id
@@ -21,47 +19,21 @@ from templates.store.schema import Base, RotationKeyRow, SecretRow, SubjectRow
 from templates.store.secrets import SECRET_PURPOSE
 from templates.store.tenants import ROTATION_PURPOSE
 
-Attribute = InstrumentedAttribute[Any]
 
-
-@dataclass(frozen=True)
-class WrappedColumn:
-    """A column of blobs under the master key, the key of its table, and what blobs are bound to."""
+class Wrapped(NamedTuple):
+    """A table with blobs under the master key: their column and purpose, what they are bound to."""
 
     table: type[Base]
-    blob: Attribute
-    wrapping_key: Attribute
-    key: Sequence[Attribute]
+    blob: str
     purpose: str
-    bound_to: Sequence[Attribute]
+    bound_to: tuple[str, ...]
 
 
 # The secrets are last: a keyring that opens them opens everything before them.
-WRAPPED_COLUMNS = (
-    WrappedColumn(
-        SubjectRow,
-        SubjectRow.wrapped_key,
-        SubjectRow.wrapping_key,
-        [SubjectRow.id],
-        DATA_KEY_PURPOSE,
-        [SubjectRow.tenant_id, SubjectRow.id],
-    ),
-    WrappedColumn(
-        RotationKeyRow,
-        RotationKeyRow.wrapped_key,
-        RotationKeyRow.wrapping_key,
-        [RotationKeyRow.tenant_id, RotationKeyRow.epoch],
-        ROTATION_PURPOSE,
-        [RotationKeyRow.tenant_id, RotationKeyRow.epoch],
-    ),
-    WrappedColumn(
-        SecretRow,
-        SecretRow.wrapped_value,
-        SecretRow.wrapping_key,
-        [SecretRow.name],
-        SECRET_PURPOSE,
-        [SecretRow.name],
-    ),
+WRAPPED = (
+    Wrapped(SubjectRow, "wrapped_key", DATA_KEY_PURPOSE, ("tenant_id", "id")),
+    Wrapped(RotationKeyRow, "wrapped_key", ROTATION_PURPOSE, ("tenant_id", "epoch")),
+    Wrapped(SecretRow, "wrapped_value", SECRET_PURPOSE, ("name",)),
 )
 
 
@@ -91,12 +63,12 @@ class WrappedKeys:
         total = broken = 0
         while keyring.current != current:  # again where the key file changed once more meanwhile
             current = keyring.current
-            for column in WRAPPED_COLUMNS:
+            for wrapped in WRAPPED:
                 after: tuple[Any, ...] | None = ()
                 while after is not None:
                     changed, failed, after = database.write(
-                        lambda connection, column=column, after=after: (  # type: ignore[misc]
-                            self._rewrap(connection, column, after, batch)
+                        lambda connection, wrapped=wrapped, after=after: (  # type: ignore[misc]
+                            self._rewrap(connection, wrapped, after, batch)
                         )
                     )
                     total, broken = total + changed, broken + failed
@@ -115,8 +87,8 @@ class WrappedKeys:
 
         def work(connection: Connection) -> dict[str, int]:
             counts: dict[str, int] = {}
-            for column in WRAPPED_COLUMNS:
-                wrapping_key = column.wrapping_key
+            for wrapped in WRAPPED:
+                wrapping_key = wrapped.table.__table__.c.wrapping_key
                 query = sa.select(wrapping_key, sa.func.count()).group_by(wrapping_key)
                 for key_id, count in connection.execute(query):
                     counts[key_id] = counts.get(key_id, 0) + count
@@ -125,32 +97,30 @@ class WrappedKeys:
         return self._context.database.read(work)
 
     def _rewrap(
-        self, connection: Connection, column: WrappedColumn, after: tuple[Any, ...], batch: int
+        self, connection: Connection, wrapped: Wrapped, after: tuple[Any, ...], batch: int
     ) -> tuple[int, int, tuple[Any, ...] | None]:
         """Wrap the next rows again; returns how many, how many do not open, and the last key."""
-        keyring = self._context.keyring
-        columns = dict.fromkeys((*column.key, *column.bound_to))
-        query: Any = (
-            sa.select(column.blob.label("blob"), *columns)
-            .where(column.wrapping_key != keyring.current)
-            .order_by(*column.key)
-            .limit(batch)
-        )
+        keyring, table = self._context.keyring, wrapped.table.__table__
+        key = sa.tuple_(*table.primary_key)
+        query: Any = sa.select(table).where(table.c.wrapping_key != keyring.current)
         if after:
-            query = query.where(sa.tuple_(*column.key) > sa.tuple_(*map(sa.literal, after)))
-        rows, broken, last = connection.execute(query).all(), 0, None
+            query = query.where(key > sa.tuple_(*map(sa.literal, after)))
+        rows = connection.execute(query.order_by(*table.primary_key).limit(batch)).all()
+        broken, last = 0, None
         for row in rows:
-            bound_to = [row._mapping[part.key] for part in column.bound_to]
-            last = tuple(row._mapping[part.key] for part in column.key)
+            values = row._mapping
+            last = tuple(values[column.name] for column in table.primary_key)
+            bound_to = [values[name] for name in wrapped.bound_to]
             try:
-                new = keyring.rewrap(row.blob, purpose=column.purpose, bound_to=bound_to)
+                new = keyring.rewrap(
+                    values[wrapped.blob], purpose=wrapped.purpose, bound_to=bound_to
+                )
             except SealError:
                 broken += 1
                 continue
-            is_row = sa.tuple_(*column.key) == sa.tuple_(*map(sa.literal, last))
             connection.execute(
-                sa.update(column.table)
-                .where(is_row)
-                .values({column.blob: new, column.wrapping_key: sealed_key_id(new)})
+                sa.update(wrapped.table)
+                .where(key == sa.tuple_(*map(sa.literal, last)))
+                .values({wrapped.blob: new, "wrapping_key": sealed_key_id(new)})
             )
         return len(rows) - broken, broken, last

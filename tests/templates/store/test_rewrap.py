@@ -8,7 +8,7 @@ from templates.errors import SealError
 from templates.keys.sealing import MasterKeyring
 from templates.store import TemplateStore
 from templates.store.database import Database
-from templates.store.rewrap import WRAPPED_COLUMNS
+from templates.store.rewrap import WRAPPED
 from templates.store.schema import Base, TemplateRow
 from tests.patience import PATIENCE_S
 from tests.templates.store.conftest import SlowSealing, put
@@ -143,6 +143,6 @@ def test_every_wrapped_column_of_the_schema_is_known() -> None:
         for column in table.columns
         if column.name.startswith("wrapped_")
     }
-    known = {(each.table.__tablename__, each.blob.key) for each in WRAPPED_COLUMNS}
+    known = {(each.table.__tablename__, each.blob) for each in WRAPPED}
     assert known == wrapped
-    assert len(WRAPPED_COLUMNS) == 3
+    assert len(WRAPPED) == 3
