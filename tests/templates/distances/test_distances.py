@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from templates.distances import (
     DEFAULT_STEPS,
     Metric,
+    exact,
     paired_distances,
     pairwise_distances,
     similarity,
@@ -234,6 +235,18 @@ def test_the_length_of_a_point_does_not_count_on_the_sphere(size: float, name: s
     templates, points = randoms(20, 2, seed=1), units(Keystream.seeded(1), 3)
     seen = matrix(name, size * points, templates, metric="spherical")
     np.testing.assert_allclose(seen, matrix(name, points, templates, metric="spherical"), rtol=1e-5)
+
+
+@pytest.mark.parametrize(("dtype", "atol"), [(np.float64, 1e-10), (np.float32, 3e-6)])
+def test_a_matrix_of_lifted_pairs_is_made_of_its_pairs(dtype: type, atol: float):
+    """One product for all, in either precision, gives what each pair gives alone in float64."""
+    a, b = faces(5, 3, seed=1), faces(6, 7, seed=2)
+    for left, right in ((a, b), (b, a), pairs()["close"]):
+        i, j = np.indices((len(left), len(right))).reshape(2, -1)
+        options = {"metric": Metric.SPHERICAL, "steps": 400}
+        expected = exact.pairs(left, right, i, j, **options).reshape(len(left), -1)
+        seen = matrix("exact", left, right, metric="spherical", steps=400, dtype=dtype)
+        np.testing.assert_allclose(similarity(seen), similarity(expected), rtol=0, atol=atol)
 
 
 # --- convergence of the spherical iteration ----------------------------------------------------

@@ -148,7 +148,7 @@ def test_a_seeded_batch_does_not_depend_on_the_tile(
 def test_a_photo_drawn_twice_is_drawn_again():
     decoys = units(Keystream.seeded("decoys"), 4)
     descriptors = units(Keystream.seeded("people"), 2)
-    nearly = decoys[1] + 1e-4 * decoys[3]
+    nearly = decoys[1] + 7e-4 * decoys[3]
     twice = np.vstack([decoys[:2], nearly / np.linalg.norm(nearly), decoys[2]])
     own = np.vstack([decoys[:3], descriptors[1]])
     for bad in (twice, own):
