@@ -487,7 +487,7 @@ def load_settings(**flags: Any) -> Settings:
 
 def settings_table() -> str:
     """Write the table of ``docs/settings.md`` from the declarations above."""
-    rows = ["| setting | variable | default | meaning |", "|---|---|---|---|"]
+    rows = ["| setting | default | meaning |", "|---|---|---|"]
     for name, field in Settings.model_fields.items():
         default = field.default
         if isinstance(default, tuple):
@@ -498,5 +498,5 @@ def settings_table() -> str:
             shown = f"`{str(default).lower()}`"
         else:
             shown = f"`{default}`"
-        rows.append(f"| `{name}` | `{ENV_PREFIX}{name.upper()}` | {shown} | {field.description} |")
+        rows.append(f"| `{name}` | {shown} | {field.description} |")
     return "\n".join(rows) + "\n"
