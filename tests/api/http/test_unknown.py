@@ -131,6 +131,14 @@ def test_a_photo_sent_in_the_wrong_way_is_told_the_right_one(
     assert said in message
 
 
+def test_a_form_field_comes_once(client: Client) -> None:
+    """Of two levels, readers would differ in which counts."""
+    sent = {"files": images(PHOTO, name="image"), "data": {"level": ["fmr-1e-3", "fmr-1e-2"]}}
+    answer = client.post("/v1/subjects/alice/verify", **sent)
+    assert_error(answer, 422, "validation_failed")
+    assert "twice" in answer.json()["error"]["message"]
+
+
 TOKEN = {"subject_id": "alice", "action": "verify"}
 
 
@@ -142,6 +150,11 @@ TOKEN = {"subject_id": "alice", "action": "verify"}
         (json.dumps(TOKEN).encode("utf-16"), {"Content-Type": "application/json"}),
         (json.dumps(TOKEN).encode("utf-32-le"), {"Content-Type": "application/json"}),
         (PHOTO, {"Content-Type": "application/json"}),
+        # Not compressed, as it says: a proxy would read something else.
+        (
+            json.dumps(TOKEN).encode(),
+            {"Content-Type": "application/json", "Content-Encoding": "gzip"},
+        ),
         (
             gzip.compress(json.dumps(TOKEN).encode(), mtime=0),
             {"Content-Type": "application/json", "Content-Encoding": "gzip"},
