@@ -98,9 +98,8 @@ class Settings(BaseSettings):
         None,
         description="File with the master keys, mode 0600, one a line, the first is current; "
         "created at first use while the database is empty. Unset: `master.key` in a folder beside "
-        "`data_dir`, of the same name with `-keys` after it; where an earlier version left "
-        "`master.key` in `data_dir` itself, that one. Without it, nothing that is stored can be "
-        "read again: keep a copy elsewhere, and not with the database.",
+        "`data_dir`, of the same name with `-keys` after it. Without it, nothing that is "
+        "stored can be read again: keep a copy elsewhere, and not with the database.",
     )
     master_key_variable: str | None = Field(
         None,
@@ -429,11 +428,7 @@ class Settings(BaseSettings):
         # A folder has one key, whatever link leads to it.
         plain = self.data_dir.name not in ("", "..") and not self.data_dir.is_symlink()
         data = self.data_dir if plain else self.data_dir.resolve()
-        apart = data.parent / f"{data.name}-keys" / "master.key"
-        of_earlier_version = self.data_dir / "master.key"
-        if of_earlier_version.exists() and not apart.exists():
-            return of_earlier_version
-        return apart
+        return data.parent / f"{data.name}-keys" / "master.key"
 
     @property
     def resolved_contract_file(self) -> Path:

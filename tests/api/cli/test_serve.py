@@ -110,8 +110,8 @@ def test_the_check_warns_where_browsers_lift_and_too_many_are_rejected(
 
 def test_a_master_key_beside_the_database_is_used_with_a_warning(world, data):
     check = ("serve", "--check", "--data-dir", data, "--pack", world.pack)
-    key_file(data).rename(data / "master.key")  # where an earlier version made it
-    ran = run(*check)
+    key_file(data).rename(data / "master.key")
+    ran = run(*check, "--master-key-file", data / "master.key")
     assert ran.status == 0, ran.stderr
     (warning,) = warnings(ran)
     assert f"{data / 'master.key'} lies in the folder of the database" in warning

@@ -70,19 +70,6 @@ def test_a_data_folder_has_one_default_master_key_by_all_its_names(
     )
 
 
-def test_a_master_key_that_an_earlier_version_left_in_the_data_folder_is_used(
-    elsewhere: Path,
-) -> None:
-    beside, apart = elsewhere / "here/master.key", elsewhere / "here-keys/master.key"
-    beside.parent.mkdir()
-    beside.write_text("key")
-    settings = load_settings(data_dir="here")
-    assert settings.resolved_master_key_file.absolute() == beside
-    apart.parent.mkdir()
-    beside.rename(apart)  # the remedy that a start names, and no setting to change
-    assert settings.resolved_master_key_file.absolute() == apart
-
-
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="the system has no affinity")
 def test_a_slot_for_each_processor_that_the_process_may_use(
     elsewhere: Path,

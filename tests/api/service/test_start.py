@@ -83,8 +83,7 @@ def test_a_master_key_beside_the_database_is_said(tmp_path: Path) -> None:
     data.mkdir()
     default = Settings(data_dir=data)
     assert key_beside_database(default) is None
-    (data / "master.key").write_text("of an earlier version")
-    said = str(key_beside_database(default))
+    said = str(key_beside_database(Settings(data_dir=data, master_key_file=data / "master.key")))
     assert str(data / "master.key") in said
     assert "move it" in said
     assert "\n" not in said
