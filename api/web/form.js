@@ -91,7 +91,7 @@ export function photoForm(id, view) {
 
   async function attempt() {
     const asking = asked;
-    const name = subject.input.value;
+    const name = subject.id();
     const sent = picker.chosen();
     const lifts = session.mode?.active() ? session.mode : null;
     const tools = { lifts, say, drop: () => picker.drop(sent), problem, send };

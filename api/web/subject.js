@@ -41,8 +41,8 @@ export const switchOf = (mode) =>
   mode?.root ??
   offNote(LIFTS && !session.mode && "Private mode could not be loaded: photos are sent to the service. Reload the page.");
 
-// `input`, its `part` of the form, and `person()`, who is known to be enrolled under the id, or null; `onperson` is called
-// where that changes.
+// `input`, its `part` of the form, `id()` in the form in which the service keeps it, and `person()`, who is known to be
+// enrolled under it, or null; `onperson` is called where that changes.
 export function subjectField(id, action, onperson) {
   const searches = may("enroll");
   const list = h("datalist", { id: newId("people") });
@@ -50,7 +50,7 @@ export function subjectField(id, action, onperson) {
   const input = h("input", {
     type: "text",
     required: true,
-    maxlength: "128",
+    maxlength: "256",
     autocomplete: "off",
     autocapitalize: "none",
     spellcheck: "false",
@@ -60,13 +60,15 @@ export function subjectField(id, action, onperson) {
   const part = field("Person’s id", input);
   let known = null;
   const person = () => known;
-  if (!searches) return { input, part, person };
+  // However it was typed, a passkey of it is the same.
+  const typedId = () => input.value.normalize("NFC");
+  if (!searches) return { input, part, id: typedId, person };
   let running = new AbortController();
   let timer = 0;
 
   async function search() {
     const { signal } = running;
-    const typed = input.value;
+    const typed = typedId();
     // It is an aid: what is wrong, the form says when it is sent.
     const page = await people(typed, { limit: SHOWN, signal }).catch(() => null);
     if (signal.aborted) return;
@@ -98,5 +100,5 @@ export function subjectField(id, action, onperson) {
   input.addEventListener("focus", () => input.value || list.childElementCount || search());
   part.append(list, status);
   if (id) search();
-  return { input, part, person };
+  return { input, part, id: typedId, person };
 }

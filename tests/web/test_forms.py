@@ -18,6 +18,7 @@ from tests.web.walk import TO_FILE, enroll
 pytestmark = pytest.mark.long
 
 NAMES = ("found-ada", "found-ben", "found-ben-2")
+DECOMPOSED = "fo\u0308und"
 DECISION = {
     "decision": "accept", "reason": "match", "level": "fmr-1e-2", "fmr": 0, "contract_id": "0" * 64,
     "calibration_id": "0" * 64, "request_id": "0" * 32,
@@ -64,6 +65,12 @@ def test_people_whose_ids_begin_so_are_suggested(open_tab: OpenTab, demo: Served
     # One that is enrolled is enough said, though another id begins with it.
     field.fill("found-ben")
     expect(page.get_by_text("✓ Enrolled: 1 photo")).to_be_visible()
+    # As the service does, the page reads an id in Unicode's form NFC.
+    enroll(demo, DECOMPOSED, "person-2")
+    field.fill(DECOMPOSED)
+    expect(page.get_by_text("✓ Enrolled: 1 photo")).to_be_visible()
+    with demo.client() as client:
+        assert client.delete(f"/v1/subjects/{DECOMPOSED}").is_success
     # A search that fails says nothing: the form does, when it is sent.
     page.route("**/v1/subjects?*", lambda route: route.abort())
     with page.expect_event("requestfailed"):
