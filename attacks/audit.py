@@ -104,7 +104,7 @@ def run_audit(
         The decoys were made of these people.
     """
     population = draw_population(
-        faces.descriptors, identities, victims=plan.victims, owners=plan.owners, seed=plan.seed
+        faces.embeddings, identities, victims=plan.victims, owners=plan.owners, seed=plan.seed
     )
     if decoys is None:
         fitted, population = without_decoy_people(population, seed=plan.seed)
@@ -114,9 +114,9 @@ def run_audit(
     else:
         if isinstance(decoys, DecoyPool):
             _require_strangers(decoys, population)
-        require_others(decoys, faces.descriptors, identities)
+        require_others(decoys, faces.embeddings, identities)
     beside = [
-        strangers_among(more, faces.descriptors, identities, population.victim_names)
+        strangers_among(more, faces.embeddings, identities, population.victim_names)
         for more in further
     ]
     strategy, dims, axes = plan.strategy, plan.dims, plan.axes

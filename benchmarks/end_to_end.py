@@ -79,7 +79,7 @@ def raw_counts(
     keep = [i for i, name in enumerate(faces.identities) if name not in names]
     crops = Extractor(pack, aligned=True, cache=cache).extract([faces.paths[i] for i in keep])
     identity = np.unique([faces.identities[i] for i in keep], return_inverse=True)[1]
-    cosines = crops.descriptors @ crops.descriptors.T
+    cosines = crops.embeddings @ crops.embeddings.T
     impostor = cosines[np.triu(identity[:, None] != identity[None, :], k=1)]
     allowed = int(float(args.level.removeprefix("fmr-")) * impostor.size)
     threshold = float(np.partition(impostor, impostor.size - allowed - 1)[-allowed - 1])

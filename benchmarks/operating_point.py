@@ -70,7 +70,7 @@ def lfw(data: Path, pack: str, cached: Path | None) -> People:
         folder = labelled_folder(data / "lfw" / "aligned112")
         extractor = Extractor(ModelPack.load(data / "packs" / pack), aligned=True)
         extraction = extractor.extract(list(folder.paths))
-        rows, names = extraction.descriptors, [path.parent.name for path in extraction.paths]
+        rows, names = extraction.embeddings, [path.parent.name for path in extraction.paths]
     more, of_more = stored(data, "lfw_rest", pack)
     person = np.unique([*names, *of_more], return_inverse=True)[1]
     return People(np.concatenate([rows, more]), person.astype(np.int64))

@@ -71,7 +71,7 @@ class Extraction:
 
     Attributes
     ----------
-    descriptors
+    embeddings
         float32, shape (k, n), unit rows, in the order of ``paths``. Never shown by ``repr``.
     paths
         The k files that were embedded, in the order in which they were given.
@@ -81,7 +81,7 @@ class Extraction:
         The embeddings with the mirror image added, where they were asked for.
     """
 
-    descriptors: NDArray[np.float32] = field(repr=False)
+    embeddings: NDArray[np.float32] = field(repr=False)
     paths: list[Path]
     failures: list[Failure]
     cached: int

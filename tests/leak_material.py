@@ -65,7 +65,7 @@ def make_material(
     others = [name for name in names if name not in sitters]
 
     faces = sorted((decoys / "train").glob("*.jpg"))[::40][:110]
-    pool = Extractor(pack, cache=cache).extract(faces).descriptors
+    pool = Extractor(pack, cache=cache).extract(faces).embeddings
     source = DecoyPool(pool)
     source.save(folder / "decoys.veil", sealer)
     strangers = [name for name in others if len(list((crops / name).glob("*.jpg"))) >= 4][:30]
@@ -73,7 +73,7 @@ def make_material(
     labelled = Extractor(pack, cache=cache, aligned=True).extract(paths)
     binding = binding_for(pack, source, strategy=Strategy.HYBRID, m=M)
     contract = calibrate(
-        labelled.descriptors,
+        labelled.embeddings,
         [path.parent.name for path in labelled.paths],
         binding=binding,
         source=source,

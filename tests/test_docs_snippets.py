@@ -197,7 +197,7 @@ def test_the_embeddings_file_of_the_page_is_read(
     names: dict[str, Any] = {"embed": lambda paths: np.eye(len(paths), 4, dtype=np.float32)}
     exec(compile(code, "docs/formats.md", "exec"), names)
     made = read_embeddings(tmp_path / "lfw.npz")
-    assert made.descriptors.shape == (len(made.paths), 4)
+    assert made.embeddings.shape == (len(made.paths), 4)
 
 
 def test_what_is_planted_is_reported(tmp_path: Path) -> None:

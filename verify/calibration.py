@@ -1,4 +1,4 @@
-"""From labelled descriptors to a contract: thresholds for stated false match rates."""
+"""From labelled embeddings to a contract: thresholds for stated false match rates."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -54,7 +54,7 @@ def part_of(progress: Progress, first: float, last: float) -> Progress:
 
 
 def calibrate(
-    descriptors: NDArray[np.floating],
+    embeddings: NDArray[np.floating],
     identities: Sequence[str],
     *,
     binding: Binding,
@@ -79,14 +79,14 @@ def calibrate(
 
     Parameters
     ----------
-    descriptors : (N, n) floating
+    embeddings : (N, n) floating
         Unit rows.
     aliases
         Second names of one person, mapped to the first.
     labels
-        Of every descriptor, for rates by group of people; none without them.
+        Of every embedding, for rates by group of people; none without them.
     pairs
-        Pairs of the ten-fold protocol, as positions in ``descriptors``; balanced random pairs
+        Pairs of the ten-fold protocol, as positions in ``embeddings``; balanced random pairs
         where None. Pairs of excluded people are left out.
     cohort_seed
         A contract's, to keep its cohort; by default a new one is drawn.
@@ -105,7 +105,7 @@ def calibrate(
     """
     options = options or CalibrationOptions()
     binding.require_source(source_id=source.source_id)
-    unit = unit_descriptors(descriptors)
+    unit = unit_descriptors(embeddings)
     if unit.shape != (len(identities), binding.n):
         raise ContractError(
             f"{len(identities)} identities and a binding of n = {binding.n} need embeddings of "
@@ -147,7 +147,7 @@ def calibrate(
         with Keystream.fresh() as stream:
             cohort_seed = stream.token(KEY_BYTES)
     run = CalibrationRun(
-        descriptors=data,
+        embeddings=data,
         plan=plan,
         templates=templates,
         nobody=Nobody(generator, binding.strategy, binding.m, cohort_seed),

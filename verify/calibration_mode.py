@@ -133,10 +133,10 @@ class CalibrationReport:
 class CalibrationRun:
     """Everything that the calibrations of one run share.
 
-    ``descriptors`` are embeddings, (N, n); templates are in the coordinates of the axes.
+    ``embeddings`` are unit rows, (N, n); templates are in the coordinates of the axes.
     """
 
-    descriptors: NDArray[np.float32]
+    embeddings: NDArray[np.float32]
     plan: TrialPlan
     templates: SubspaceBatch
     nobody: Nobody
@@ -168,7 +168,7 @@ def point_sets(run: CalibrationRun, rng: np.random.Generator) -> list[ProbeSets]
 def calibrate_points(run: CalibrationRun, sets: ProbeSets) -> Calibration:
     """Calibrate raw probes of one number of photos."""
     impostors, genuine = point_trials(
-        run.descriptors,
+        run.embeddings,
         run.plan,
         run.templates,
         run.nobody,
@@ -185,7 +185,7 @@ def calibrate_lifted(run: CalibrationRun, probe_m: int, rng: np.random.Generator
     options = run.options
     with Keystream.seeded("calibration probes", options.seed, probe_m) as stream:
         trials = lifted_trials(
-            run.descriptors,
+            run.embeddings,
             run.plan,
             run.templates,
             run.nobody.cohort,
@@ -304,8 +304,8 @@ def _ten_fold(run: CalibrationRun, probe_m: int) -> TenFold:
     probing, positions = np.unique(seconds, return_inverse=True)
     options = run.options
     with Keystream.seeded("ten folds", options.seed, probe_m) as stream:
-        templates = run.service.lift(run.descriptors[enrolled], m=run.templates.m, stream=stream)
-        raw = run.descriptors[probing]
+        templates = run.service.lift(run.embeddings[enrolled], m=run.templates.m, stream=stream)
+        raw = run.embeddings[probing]
         probes: Probes = run.nobody.generator.project(raw)
         if probe_m:
             probes = run.client.lift(raw, m=probe_m, stream=stream)

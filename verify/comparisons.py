@@ -50,13 +50,13 @@ class Lifter:
     source: DecoySource
     contract_id: str
 
-    def lift(self, descriptors: NDArray[np.float32], *, m: int, stream: Keystream) -> SubspaceBatch:
+    def lift(self, embeddings: NDArray[np.float32], *, m: int, stream: Keystream) -> SubspaceBatch:
         """Project embeddings, lift, encode, decode; hybrid+ takes decoys of any label."""
         anybody = None
         if self.strategy is Strategy.HYBRID_PLUS:
-            anybody = [Attributes()] * len(descriptors)
+            anybody = [Attributes()] * len(embeddings)
         lifted = lift(
-            self.source.project(descriptors),
+            self.source.project(embeddings),
             strategy=self.strategy,
             m=m,
             source=self.source,
@@ -77,7 +77,7 @@ def through_wire(batch: SubspaceBatch, *, contract_id: str) -> SubspaceBatch:
 
 
 def point_trials(
-    descriptors: NDArray[np.float32],
+    embeddings: NDArray[np.float32],
     plan: TrialPlan,
     templates: SubspaceBatch,
     nobody: Nobody,
@@ -103,7 +103,7 @@ def point_trials(
     what = f"comparing probes of {photos_in_words(sets.photos.shape[1])} with templates"
     for start in range(0, len(owners), PROBE_TILE):
         rows = slice(start, start + PROBE_TILE)
-        probes = nobody.generator.project(sets.means(descriptors, sets.impostor[rows]))
+        probes = nobody.generator.project(sets.means(embeddings, sets.impostor[rows]))
         distances = pairwise_distances(probes, templates, metric=metric)
         means, spreads = nobody.statistics(probes, metric)
         scores[rows] = (similarity(distances) - means[:, None]) / spreads[:, None]
@@ -111,7 +111,7 @@ def point_trials(
     with_template = np.flatnonzero(plan.template_of[owners] >= 0)
     scores[with_template, plan.template_of[owners[with_template]]] = -np.inf
     own = plan.person_of[sets.photos[: sets.genuine, 0]]
-    probes = sets.means(descriptors, slice(sets.genuine))
+    probes = sets.means(embeddings, slice(sets.genuine))
     if len(probes):
         probes = nobody.generator.project(probes)
     else:
@@ -129,7 +129,7 @@ def point_trials(
         ((close - means) / spreads).astype(np.float32),
         own,
         _enrolled_photos(plan, own),
-        refused=sets.disagreeing(descriptors, consistency=consistency),
+        refused=sets.disagreeing(embeddings, consistency=consistency),
     )
     probes_of = np.bincount(owners, minlength=people).astype(np.float64)
 
@@ -169,7 +169,7 @@ class LiftedTrials:
 
 
 def lifted_trials(
-    descriptors: NDArray[np.float32],
+    embeddings: NDArray[np.float32],
     plan: TrialPlan,
     templates: SubspaceBatch,
     cohort: SubspaceBatch,
@@ -197,7 +197,7 @@ def lifted_trials(
     room = min(len(extra), most_probes - len(genuine_photos))
     chosen = np.concatenate([genuine_photos, rng.choice(extra, room, replace=False)])
     owners = plan.person_of[chosen]
-    probes = lifter.lift(descriptors[chosen], m=probe_m, stream=stream)
+    probes = lifter.lift(embeddings[chosen], m=probe_m, stream=stream)
     means, spreads = np.empty(len(chosen)), np.empty(len(chosen))
     scores: list[NDArray[np.float32]] = []
     met: list[Indices] = []

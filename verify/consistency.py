@@ -60,7 +60,7 @@ class Consistency:
 
 
 def photo_consistency(
-    descriptors: NDArray[np.float32],
+    embeddings: NDArray[np.float32],
     person_of: NDArray[np.int64],
     *,
     photos: int,
@@ -75,7 +75,7 @@ def photo_consistency(
 
     Parameters
     ----------
-    descriptors : (N, n) float32
+    embeddings : (N, n) float32
         Unit rows.
     person_of : (N,) int64
     photos
@@ -97,10 +97,10 @@ def photo_consistency(
     tails are lighter, so the value errs to the strict side, and single pairs of one person under
     two names, which dominate what is seen there, do not move it.
     """
-    impostor = impostor_cosines(descriptors, person_of, rng=rng)
+    impostor = impostor_cosines(embeddings, person_of, rng=rng)
     tail = impostor_tail(impostor)
     lax, strict = tail.lax, tail.at(STRICTEST_FMR)
-    genuine = np.sort(_genuine_agreements(descriptors, person_of, photos=photos, rng=rng))
+    genuine = np.sort(_genuine_agreements(embeddings, person_of, photos=photos, rng=rng))
     threshold = lax
     if len(genuine):
         allowed = max(0, int(MOST_REFUSED * (len(genuine) + 1)) - 1)
@@ -114,11 +114,11 @@ def photo_consistency(
 
 
 def match_cosine(
-    descriptors: NDArray[np.float32], identities: Sequence[str], *, seed: int = 0
+    embeddings: NDArray[np.float32], identities: Sequence[str], *, seed: int = 0
 ) -> float:
-    """Raw cosine at FMR 1e-3 of labelled unit descriptors, (N, n): a match without any template."""
+    """Raw cosine at FMR 1e-3 of labelled unit embeddings, (N, n): a match without any template."""
     person_of = np.unique(np.asarray(identities), return_inverse=True)[1]
-    impostor = impostor_cosines(descriptors, person_of, rng=np.random.default_rng(seed))
+    impostor = impostor_cosines(embeddings, person_of, rng=np.random.default_rng(seed))
     return impostor_tail(impostor).lax
 
 
@@ -147,7 +147,7 @@ def impostor_tail(impostor: NDArray[np.float32]) -> ImpostorTail:
 
 
 def _genuine_agreements(
-    descriptors: NDArray[np.float32],
+    embeddings: NDArray[np.float32],
     person_of: NDArray[np.int64],
     *,
     photos: int,
@@ -160,7 +160,7 @@ def _genuine_agreements(
         size -= 1
     return np.array(
         [
-            weakest_split(descriptors[rng.permutation(own)[:size]]).agreement
+            weakest_split(embeddings[rng.permutation(own)[:size]]).agreement
             for own in people
             if len(own) >= size
             for _ in range(DRAWS)
@@ -178,7 +178,7 @@ class SuspiciousPair:
 
 
 def impostor_cosines(
-    descriptors: NDArray[np.float32], person_of: NDArray[np.int64], *, rng: np.random.Generator
+    embeddings: NDArray[np.float32], person_of: NDArray[np.int64], *, rng: np.random.Generator
 ) -> NDArray[np.float32]:
     """Raw cosines of all pairs of photos of different people.
 
@@ -189,10 +189,10 @@ def impostor_cosines(
     ContractError
         Where there is no such pair.
     """
-    if len(descriptors) > MOST_PHOTOS:
-        kept = rng.choice(len(descriptors), MOST_PHOTOS, replace=False)
-        descriptors, person_of = descriptors[kept], person_of[kept]
-    tiles = [tile[mask] for _, tile, mask in _cross_tiles(descriptors, person_of)]
+    if len(embeddings) > MOST_PHOTOS:
+        kept = rng.choice(len(embeddings), MOST_PHOTOS, replace=False)
+        embeddings, person_of = embeddings[kept], person_of[kept]
+    tiles = [tile[mask] for _, tile, mask in _cross_tiles(embeddings, person_of)]
     impostor = np.concatenate([np.empty(0, dtype=np.float32), *tiles])
     if impostor.size == 0:
         raise ContractError(
@@ -202,7 +202,7 @@ def impostor_cosines(
 
 
 def suspicious_pairs(
-    descriptors: NDArray[np.float32],
+    embeddings: NDArray[np.float32],
     person_of: NDArray[np.int64],
     people: Sequence[str],
     *,
@@ -210,7 +210,7 @@ def suspicious_pairs(
 ) -> list[SuspiciousPair]:
     """Pairs of people with two photos of raw cosine ``above`` or more, most alike first."""
     best: dict[tuple[int, int], float] = {}
-    for start, tile, mask in _cross_tiles(descriptors, person_of):
+    for start, tile, mask in _cross_tiles(embeddings, person_of):
         rows, columns = np.nonzero(mask & (tile >= np.float32(above)))
         for row, column in zip(rows.tolist(), columns.tolist(), strict=True):
             a, b = int(person_of[start + row]), int(person_of[start + column])
@@ -221,12 +221,12 @@ def suspicious_pairs(
 
 
 def _cross_tiles(
-    descriptors: NDArray[np.float32], person_of: NDArray[np.int64]
+    embeddings: NDArray[np.float32], person_of: NDArray[np.int64]
 ) -> Iterator[tuple[int, NDArray[np.float32], NDArray[np.bool_]]]:
     """Yield (start, cosines, mask) of the upper triangle; columns begin at ``start`` as rows do."""
-    count = len(descriptors)
+    count = len(embeddings)
     for start in range(0, count, TILE):
         stop = min(start + TILE, count)
-        tile = descriptors[start:stop] @ descriptors[start:].T
+        tile = embeddings[start:stop] @ embeddings[start:].T
         later = np.arange(start, count)[None, :] > np.arange(start, stop)[:, None]
         yield start, tile, later & (person_of[start:stop, None] != person_of[None, start:])

@@ -152,9 +152,9 @@ def read_lfw_pairs(
     Parameters
     ----------
     paths
-        Photos with a descriptor, in its order; ``Name/Name_0001.jpg``.
+        Photos with an embedding, in its order; ``Name/Name_0001.jpg``.
     missing
-        Photos of the same folder without a descriptor; pairs that need one are left out. The
+        Photos of the same folder without an embedding; pairs that need one are left out. The
         caller reports them as failures to acquire.
 
     Raises

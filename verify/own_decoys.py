@@ -1,7 +1,7 @@
 """Whether decoys were made of the very people that a calibration measures.
 
 Such decoys resemble the enrolled people more than those of a deployment resemble its users: the
-calibration then measures something that nobody will see. A generator holds no descriptor and names
+calibration then measures something that nobody will see. A generator holds no embedding and names
 nobody, but along its axes the faces that it was made of do not correlate, and others do.
 """
 
@@ -47,10 +47,10 @@ class Memory:
     least: float
 
 
-def memory(generator: DecoyGenerator, descriptors: NDArray[np.floating]) -> Memory:
+def memory(generator: DecoyGenerator, embeddings: NDArray[np.floating]) -> Memory:
     """Measure what a generator remembers of (N, n) unit embeddings."""
     turn = np.linalg.eigh(generator.covariance)[1][:, ::-1]
-    scores = np.asarray(descriptors, dtype=np.float64) @ generator.axes.astype(np.float64) @ turn
+    scores = np.asarray(embeddings, dtype=np.float64) @ generator.axes.astype(np.float64) @ turn
     # The leading axes carry clusters, such as gender, which correlate in any part of the people.
     scores = scores[:, generator.k // 4 :]
     scores -= scores.mean(axis=0)
@@ -69,19 +69,19 @@ def memory(generator: DecoyGenerator, descriptors: NDArray[np.floating]) -> Memo
 
 
 def require_others(
-    source: DecoySource, descriptors: NDArray[np.float32], identities: Sequence[str]
+    source: DecoySource, embeddings: NDArray[np.float32], identities: Sequence[str]
 ) -> None:
     """Refuse decoys that were made of the people who are to be calibrated on.
 
     Parameters
     ----------
-    descriptors, identities : (N, n) float32 unit rows, N names
+    embeddings, identities : (N, n) float32 unit rows, N names
         Of the calibration, without those that are left out of it.
 
     Raises
     ------
     ContractError
-        A generator was fitted to these descriptors or most of them, or more than one in fifty
+        A generator was fitted to these embeddings or most of them, or more than one in fifty
         people have a pool entry that is as alike as two photos of one person are. Also where there
         are no two people to compare.
 
@@ -89,14 +89,14 @@ def require_others(
     names, person = np.unique(np.asarray(identities, dtype=np.str_), return_inverse=True)
     firsts = np.unique(person, return_index=True)[1]
     if isinstance(source, DecoyGenerator):
-        seen = [memory(source, rows) for rows in (descriptors, descriptors[firsts])]
+        seen = [memory(source, rows) for rows in (embeddings, embeddings[firsts])]
         if any(trace.correlation < trace.least for trace in seen):
             raise ContractError(
                 "the decoys were made of the photos of these people, or of most of them: " + _REMEDY
             )
     elif isinstance(source, DecoyPool):
-        likeness = _likeness(descriptors, person, entries=len(source))
-        rows = resembling_rows(descriptors, source.entries[0], cosine=likeness)
+        likeness = _likeness(embeddings, person, entries=len(source))
+        rows = resembling_rows(embeddings, source.entries[0], cosine=likeness)
         known = len(np.unique(person[rows]))
         if known > max(1, MOST_PEOPLE * len(names)):
             raise ContractError(
@@ -104,9 +104,7 @@ def require_others(
             )
 
 
-def _likeness(
-    descriptors: NDArray[np.float32], person: NDArray[np.int64], *, entries: int
-) -> float:
+def _likeness(embeddings: NDArray[np.float32], person: NDArray[np.int64], *, entries: int) -> float:
     """Cosine from which on a pool entry is taken for a photo of a person of the calibration.
 
     The median cosine of two photos of one person, or more where strangers are so alike that one
@@ -115,8 +113,8 @@ def _likeness(
     order = np.argsort(person, kind="stable")
     same = person[order][1:] == person[order][:-1]
     pairs = order[:-1][same], order[1:][same]
-    genuine = np.einsum("ij,ij->i", descriptors[pairs[0]], descriptors[pairs[1]])
-    tail = impostor_tail(impostor_cosines(descriptors, person, rng=np.random.default_rng(0)))
-    tries = entries * len(descriptors) / (person.max() + 1)
+    genuine = np.einsum("ij,ij->i", embeddings[pairs[0]], embeddings[pairs[1]])
+    tail = impostor_tail(impostor_cosines(embeddings, person, rng=np.random.default_rng(0)))
+    tries = entries * len(embeddings) / (person.max() + 1)
     chance = min(tail.at(MOST_PEOPLE / 2 / tries), SAME_PHOTO)
     return max(float(np.median(genuine)) if len(genuine) else SAME_PHOTO, chance)

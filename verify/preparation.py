@@ -76,7 +76,7 @@ _TILE = 2_048
 
 def without_lookalikes(extraction: Extraction) -> Extraction:
     """Drop photos that resemble an earlier one, of faces of which each shows another person."""
-    rows = extraction.descriptors
+    rows = extraction.embeddings
     stays = np.ones(len(rows), dtype=np.bool_)
     for start in range(0, len(rows), _TILE):
         tile = rows[start : start + _TILE]
@@ -111,11 +111,11 @@ def make_generator(
     PreparationError
         Photos of ``like`` are also among those that are adapted to it.
     """
-    rows, made = extraction.descriptors, made_with(pack)
+    rows, made = extraction.embeddings, made_with(pack)
     if like is None:
         with single_threaded():
             return DecoyGenerator.fit(rows, made_with=made)
-    sample = like.extraction.descriptors
+    sample = like.extraction.embeddings
     twice = len(resembling_rows(sample, rows, cosine=SAME_PHOTO))
     if twice:
         raise PreparationError(
@@ -138,7 +138,7 @@ def make_pool(
         A photo has no label: hybrid+ could not tell what it is.
     """
     if labels is None:
-        return DecoyPool(extraction.descriptors, made_with=made_with(pack))
+        return DecoyPool(extraction.embeddings, made_with=made_with(pack))
     labels_of_photos = [labels.get(path.resolve()) for path in extraction.paths]
     missing = [
         path.name
@@ -151,7 +151,7 @@ def make_pool(
             "of this folder, or leave those photos out"
         )
     return DecoyPool(
-        extraction.descriptors,
+        extraction.embeddings,
         labels=[label for label in labels_of_photos if label],
         made_with=made_with(pack),
     )

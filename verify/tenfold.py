@@ -45,7 +45,7 @@ class TenFold:
 
 
 GRID = np.arange(0, 400) / 100
-"""The literature's thresholds for raw descriptors: squared L2 distances 0 … 3.99."""
+"""The literature's thresholds for raw embeddings: squared L2 distances 0 … 3.99."""
 
 Search = Callable[[NDArray[np.float64], NDArray[np.bool_]], float]
 
@@ -75,7 +75,7 @@ def best_threshold(similarities: ArrayLike, same: ArrayLike) -> float:
 
 
 def best_grid_threshold(similarities: ArrayLike, same: ArrayLike) -> float:
-    """Threshold of best accuracy on the literature's grid; for raw descriptors only.
+    """Threshold of best accuracy on the literature's grid; for raw embeddings only.
 
     The grid is of squared L2 distances t = 0, 0.01 … 3.99; a pair matches where its distance is
     *below* t; the first best t wins (InsightFace's ``verification.py``). The result is the lowest

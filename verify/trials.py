@@ -112,20 +112,20 @@ class ProbeSets:
     genuine: int
     impostor: Indices
 
-    def means(self, descriptors: NDArray[np.float32], rows: slice | Indices) -> NDArray[np.float32]:
-        """Average and normalise the descriptors of some sets."""
+    def means(self, embeddings: NDArray[np.float32], rows: slice | Indices) -> NDArray[np.float32]:
+        """Average and normalise the embeddings of some sets."""
         if self.photos.shape[1] == 1:
-            return descriptors[self.photos[rows, 0]]
-        return unit_means(descriptors[self.photos[rows]])
+            return embeddings[self.photos[rows, 0]]
+        return unit_means(embeddings[self.photos[rows]])
 
     def disagreeing(
-        self, descriptors: NDArray[np.float32], *, consistency: float
+        self, embeddings: NDArray[np.float32], *, consistency: float
     ) -> NDArray[np.bool_]:
         """Tell which genuine sets a service refuses as photos of two people, (genuine,)."""
         if self.photos.shape[1] == 1:
             return np.zeros(self.genuine, dtype=np.bool_)
         agreements = [
-            weakest_split(descriptors[photos]).agreement for photos in self.photos[: self.genuine]
+            weakest_split(embeddings[photos]).agreement for photos in self.photos[: self.genuine]
         ]
         return np.array(agreements, dtype=np.float64) < consistency
 
@@ -171,14 +171,14 @@ def _runs(people: Sequence[Indices], length: int, rng: np.random.Generator) -> I
     return np.concatenate(runs)
 
 
-def enrolled_means(descriptors: NDArray[np.float32], plan: TrialPlan) -> NDArray[np.float32]:
+def enrolled_means(embeddings: NDArray[np.float32], plan: TrialPlan) -> NDArray[np.float32]:
     """Average and normalise every person's enrolled photos, (people, n)."""
-    return np.concatenate([unit_means(descriptors[photos][None]) for photos in plan.enrolled])
+    return np.concatenate([unit_means(embeddings[photos][None]) for photos in plan.enrolled])
 
 
-def unit_means(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Average and normalise sets of descriptors, (S, k, n) to (S, n)."""
-    means = descriptors.mean(axis=1, dtype=np.float64)
+def unit_means(embeddings: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Average and normalise sets of embeddings, (S, k, n) to (S, n)."""
+    means = embeddings.mean(axis=1, dtype=np.float64)
     return normalised(means).astype(np.float32)
 
 

@@ -104,12 +104,12 @@ def calibrate_folder(
     names = [name_of[path] for path in extraction.paths]
     kept, staying = chosen_photos(names, exclude=exclude, aliases=aliases or {})
     if len(kept):
-        require_others(source, extraction.descriptors[kept], staying)
+        require_others(source, extraction.embeddings[kept], staying)
     # Thousands of products of small matrices: with a second thread for each, the library spends
     # most of its time waiting. The distances have threads of their own.
     with single_threaded():
         point = operating_point(
-            extraction.descriptors[kept],
+            extraction.embeddings[kept],
             staying,
             source,
             strategy=strategy,
@@ -121,7 +121,7 @@ def calibrate_folder(
         source = source.reduced(point.axes)
         probe_dims = tuple(dim for dim in options.probe_dims if dim <= point.dim)
         done = calibrate(
-            extraction.descriptors,
+            extraction.embeddings,
             names,
             binding=binding_for(pack, source, strategy=strategy, m=point.dim),
             source=source,

@@ -119,9 +119,9 @@ def build(
         if kind is Kind.GENERATOR
         else make_pool(extraction, attributes, pack)
     )
-    if kind is Kind.GENERATOR and len(extraction.descriptors) < FACES_PER_DIMENSION * source.n:
+    if kind is Kind.GENERATOR and len(extraction.embeddings) < FACES_PER_DIMENSION * source.n:
         message(
-            f"note: {len(extraction.descriptors)} faces are few for {source.n} numbers each: the "
+            f"note: {len(extraction.embeddings)} faces are few for {source.n} numbers each: the "
             f"generator gives away who they are; use {FACES_PER_DIMENSION * source.n} or more"
         )
     path = out or settings.resolved_decoys_file
@@ -141,7 +141,7 @@ def build(
             "note: people in a pool are accepted by every template that uses them as a decoy; "
             "never enroll them"
         )
-    made = f"{kind} from {len(extraction.descriptors)} embeddings"
+    made = f"{kind} from {len(extraction.embeddings)} embeddings"
     if kind_of is not None:
         made += f", adapted to {len(kind_of.people)} of --like"
     if labelled:
@@ -154,7 +154,7 @@ def build(
             "source_id": source.source_id,
             "made_with": source.made_with,
             "n": source.n,
-            "descriptors": len(extraction.descriptors),
+            "descriptors": len(extraction.embeddings),
             "like": len(kind_of.people) if kind_of else 0,
             "labelled": labelled,
             "left_out": left_out,

@@ -31,8 +31,8 @@ def estimated_labels(
     return PhotoLabels(
         {
             attribute: voted(
-                photos.descriptors,
-                faces.descriptors,
+                photos.embeddings,
+                faces.embeddings,
                 [str(getattr(labels[path], attribute)) for path in faces.paths],
             )
             for attribute in CLASSES

@@ -144,8 +144,8 @@ def further_faces(
             path.parent.name if path.parent.resolve() != source.resolve() else ""
             for path in faces.paths
         )
-        return FurtherFaces(source.resolve().name, faces.descriptors, names)
+        return FurtherFaces(source.resolve().name, faces.embeddings, names)
     rows = read_embeddings(source)
     return FurtherFaces(
-        source.name, rows.descriptors, tuple(PurePath(path).parent.name for path in rows.paths)
+        source.name, rows.embeddings, tuple(PurePath(path).parent.name for path in rows.paths)
     )

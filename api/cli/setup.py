@@ -319,7 +319,7 @@ def part_of(extraction: Extraction, photos: Collection[Path]) -> Extraction:
     chosen = set(photos)
     rows = [row for row, path in enumerate(extraction.paths) if path in chosen]
     return Extraction(
-        extraction.descriptors[rows],
+        extraction.embeddings[rows],
         [extraction.paths[row] for row in rows],
         [failure for failure in extraction.failures if failure.path in chosen],
         cached=0,
@@ -338,7 +338,7 @@ def _fitted(
     faces, sample = part_of(extraction, roles.faces), part_of(extraction, roles.sample)
     twice = set()
     for others in (people, sample):
-        rows = resembling_rows(faces.descriptors, others.descriptors, cosine=SAME_PHOTO)
+        rows = resembling_rows(faces.embeddings, others.embeddings, cosine=SAME_PHOTO)
         twice |= {faces.paths[row] for row in rows}
     if twice:
         message(f"note: {len(twice):,} of --faces are photos of people in another role: left out")

@@ -209,7 +209,7 @@ def _calibrate(
 
 def _extract(pack: ModelPack, photos: Sequence[Path]) -> Extraction:
     extraction = Extractor(pack).extract(photos)
-    if not len(extraction.descriptors):
+    if not len(extraction.embeddings):
         raise StartError("no photo gave an embedding; are these photos of faces?")
     return extraction
 

@@ -50,7 +50,7 @@ def labelled_faces(
 ) -> LabelledFaces:
     """Join the photos that were embedded with their labels."""
     return LabelledFaces.of_names(
-        photos.descriptors,
+        photos.embeddings,
         {name: [str(getattr(labels[path], name)) for path in photos.paths] for name in attributes},
         {name: CLASSES[name] for name in attributes},
     )

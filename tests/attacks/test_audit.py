@@ -24,7 +24,7 @@ def test_an_audit_of_two_schemes_is_on_their_axes_and_reports_its_progress() -> 
         PEOPLE.names,
         pack=PACK,
         decoys=generator(),
-        further=[FurtherFaces("more", FACES.descriptors[:7], tuple(PEOPLE.names[:7]))],
+        further=[FurtherFaces("more", FACES.embeddings[:7], tuple(PEOPLE.names[:7]))],
         progress=shares.append,
     )
     assert shares == sorted(shares)

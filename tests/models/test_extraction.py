@@ -38,10 +38,10 @@ def test_rows_follow_the_order_of_the_paths(pack, files, monkeypatch):
     monkeypatch.setattr(extraction, "CHUNK", 3)
     order = [4, 0, 6, 2, 1, 5, 3]
     result = Extractor(pack).extract([files[i] for i in order])
-    np.testing.assert_allclose(result.descriptors, expected(order), atol=2e-5)
+    np.testing.assert_allclose(result.embeddings, expected(order), atol=2e-5)
     assert result.paths == [files[i] for i in order]
-    assert result.descriptors.dtype == np.float32
-    assert result.descriptors.flags.c_contiguous
+    assert result.embeddings.dtype == np.float32
+    assert result.embeddings.flags.c_contiguous
     assert result.failures == []
 
 
@@ -61,7 +61,7 @@ def test_every_file_is_accounted_for(pack, files, tmp_path):
     ]
     assert all(failure.reason.endswith(".") for failure in result.failures)
     assert result.failure_counts() == {"unsupported_image": 3, "unreadable_file": 1}
-    np.testing.assert_allclose(result.descriptors, expected([0, 1]), atol=2e-5)
+    np.testing.assert_allclose(result.embeddings, expected([0, 1]), atol=2e-5)
 
 
 def test_a_file_over_the_limit_is_not_read_whole(pack, tmp_path):
@@ -80,7 +80,7 @@ def test_copies_of_one_file_are_embedded_once(pack, files, tmp_path, monkeypatch
     monkeypatch.setattr(pack, "embed", lambda crops: seen.append(len(crops)) or real(crops))
     result = Extractor(pack).extract([files[0], copy, files[1]])
     assert seen == [2]
-    np.testing.assert_allclose(result.descriptors, expected([0, 0, 1]), atol=2e-5)
+    np.testing.assert_allclose(result.embeddings, expected([0, 0, 1]), atol=2e-5)
 
 
 def test_the_cache_spares_the_second_run(pack, files, monkeypatch):
@@ -90,7 +90,7 @@ def test_the_cache_spares_the_second_run(pack, files, monkeypatch):
     monkeypatch.setattr(pack, "embed", lambda crops: pytest.fail("embedded again"))
     second = Extractor(pack, cache=cache).extract(files[::-1])
     assert second.cached == len(files)
-    np.testing.assert_array_equal(second.descriptors, first.descriptors[::-1])
+    np.testing.assert_array_equal(second.embeddings, first.embeddings[::-1])
 
 
 def test_another_model_or_preprocessing_misses_the_cache(pack, files, tmp_path):
@@ -118,7 +118,7 @@ def test_the_cache_file_is_written_even_when_inference_breaks(pack, files, monke
 
 def test_repr_shows_no_numbers(pack, files):
     result = Extractor(pack).extract(files[:1])
-    assert "descriptors" not in repr(result)
+    assert "embeddings" not in repr(result)
 
 
 # -- real models and real faces ----------------------------------------------------------------
@@ -130,7 +130,7 @@ def test_aligned_crops_skip_detection(mbf_pack_dir, lfw_aligned, monkeypatch):
     paths = sorted(lfw_aligned.glob("*/*_0001.jpg"))[:3]
     result = Extractor(pack, aligned=True).extract(paths)
     crops = np.stack([np.asarray(Image.open(io.BytesIO(p.read_bytes()))) for p in paths])
-    np.testing.assert_allclose(result.descriptors, pack.embed(crops), atol=1e-5)
+    np.testing.assert_allclose(result.embeddings, pack.embed(crops), atol=1e-5)
 
 
 def test_both_kinds_at_once_are_those_of_two_packs(tmp_path, files, monkeypatch):
@@ -139,8 +139,8 @@ def test_both_kinds_at_once_are_those_of_two_packs(tmp_path, files, monkeypatch)
     plain, flipped = (ModelPack.load(folder, threads=1, flip=flip) for flip in (False, True))
     cache = EmbeddingCache()
     both = Extractor(plain, mirrored=True, cache=cache).extract(files)
-    np.testing.assert_array_equal(both.descriptors, Extractor(plain).extract(files).descriptors)
-    np.testing.assert_array_equal(both.mirrored, Extractor(flipped).extract(files).descriptors)
+    np.testing.assert_array_equal(both.embeddings, Extractor(plain).extract(files).embeddings)
+    np.testing.assert_array_equal(both.mirrored, Extractor(flipped).extract(files).embeddings)
     # What one of the packs has embedded alone is known to both, and the other way round.
     assert len(cache) == 2 * len(files)
     assert Extractor(flipped, cache=cache).extract(files).cached == len(files)
@@ -157,7 +157,7 @@ def test_encoded_photos_stand_under_their_names(pack, files):
     result = Extractor(pack).extract([*photos, Photo("bad", b"x")])
     assert [str(path) for path in result.paths] == [photo.name for photo in photos]
     assert [(str(f.path), f.code) for f in result.failures] == [("bad", "unsupported_image")]
-    np.testing.assert_array_equal(result.descriptors, Extractor(pack).extract(files).descriptors)
+    np.testing.assert_array_equal(result.embeddings, Extractor(pack).extract(files).embeddings)
     assert "source" not in repr(photos[0])
 
 
@@ -170,12 +170,12 @@ def test_a_marked_face_is_aligned_by_its_marks_where_there_is_no_detector(pack, 
     for source in (path, path.read_bytes()):
         cache = EmbeddingCache()
         found = Extractor(pack, cache=cache).extract([Photo("photo", source, marks)])
-        np.testing.assert_allclose(found.descriptors, alone, atol=1e-6)
+        np.testing.assert_allclose(found.embeddings, alone, atol=1e-6)
         assert [path.stem for path in found.paths] == ["photo"]
         # Other marks are another face, for the cache too.
         again = Extractor(pack, cache=cache).extract([Photo("photo", source, marks + 5)])
         assert again.cached == 0
-        assert not np.allclose(again.descriptors, alone, atol=1e-3)
+        assert not np.allclose(again.embeddings, alone, atol=1e-3)
     # Said to be an aligned crop, it is taken as one: this one is not square.
     told = Extractor(pack, aligned=True).extract([Photo("photo", path, marks)])
     assert [failure.code for failure in told.failures] == ["unsupported_image"]

@@ -17,7 +17,7 @@ NEIGHBOURS = 10
 _ROWS = 1024
 
 
-def predict_attributes(descriptors: NDArray[np.float32], pool: DecoyPool) -> list[Attributes]:
+def predict_attributes(embeddings: NDArray[np.float32], pool: DecoyPool) -> list[Attributes]:
     """Predict gender and race by the vote of the nearest entries of a labelled pool.
 
     hybrid+ needs the attributes of the faces it lifts; the paper predicts those of unlabelled
@@ -25,7 +25,7 @@ def predict_attributes(descriptors: NDArray[np.float32], pool: DecoyPool) -> lis
 
     Parameters
     ----------
-    descriptors : (N, n) float32
+    embeddings : (N, n) float32
         Unit rows.
 
     Returns
@@ -44,8 +44,8 @@ def predict_attributes(descriptors: NDArray[np.float32], pool: DecoyPool) -> lis
             "attributes are predicted from a labelled decoy pool, and this one has no labels; "
             "build the pool from a folder with FairFace labels"
         )
-    genders = voted(descriptors, entries, [label.gender for label in labels])
-    races = voted(descriptors, entries, [label.race for label in labels])
+    genders = voted(embeddings, entries, [label.gender for label in labels])
+    races = voted(embeddings, entries, [label.race for label in labels])
     return [Attributes(gender, race) for gender, race in zip(genders, races, strict=True)]
 
 
@@ -91,7 +91,7 @@ def known_attributes(
 
 
 def voted(
-    descriptors: NDArray[np.float32],
+    embeddings: NDArray[np.float32],
     entries: NDArray[np.float32],
     labels: Sequence[str | None],
 ) -> list[str | None]:
@@ -101,20 +101,20 @@ def voted(
 
     Parameters
     ----------
-    descriptors, entries : (N, n) and (K, n) float32
+    embeddings, entries : (N, n) and (K, n) float32
         Unit rows.
     labels
         One per entry; None where it has none.
     """
     known = [i for i, label in enumerate(labels) if label is not None]
-    if not known or not len(descriptors):
-        return [None] * len(descriptors)
+    if not known or not len(embeddings):
+        return [None] * len(embeddings)
     names, number_of = np.unique([str(labels[i]) for i in known], return_inverse=True)
     nearest_of, k = entries[known].T, min(NEIGHBOURS, len(known))
     chosen: list[str | None] = []
-    for start in range(0, len(descriptors), _ROWS):
+    for start in range(0, len(embeddings), _ROWS):
         # Of unit rows, the nearest by Euclidean distance are the nearest by angle.
-        cosines = descriptors[start : start + _ROWS] @ nearest_of
+        cosines = embeddings[start : start + _ROWS] @ nearest_of
         nearest = np.argpartition(-cosines, k - 1, axis=1)[:, :k]
         votes = (number_of[nearest][:, :, None] == np.arange(len(names))).sum(axis=1)
         chosen += [str(name) for name in names[votes.argmax(axis=1)]]

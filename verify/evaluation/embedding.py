@@ -63,7 +63,7 @@ class FileEmbedder:
     def model(self) -> Model:
         """Name and SHA-256 of the file."""
         facts: Json = {"embeddings": self.name, "sha256": self.file.sha256}
-        return Model(int(self.file.descriptors.shape[1]), facts)
+        return Model(int(self.file.embeddings.shape[1]), facts)
 
     def embed(
         self, pairs: VerificationSet, *, cache: EmbeddingCache | None, progress: Progress
@@ -74,7 +74,7 @@ class FileEmbedder:
         present = positions >= 0
         return EmbeddedSet(
             pairs,
-            np.ascontiguousarray(self.file.descriptors[positions[present]]),
+            np.ascontiguousarray(self.file.embeddings[positions[present]]),
             np.where(present, np.cumsum(present) - 1, -1),
             tuple(
                 Failure(Path(pairs.pictures[place].name), "not_in_file", "The file lacks it.")
@@ -132,7 +132,7 @@ class PackEmbedder:
         reason_of[""] = Failure(Path(), "unreadable_file", "The file cannot be read.")
         return EmbeddedSet(
             pairs,
-            extraction.descriptors,
+            extraction.embeddings,
             np.array([row_of.get(content, -1) for content in contents], dtype=np.int64),
             tuple(
                 replace(reason_of[content], path=Path(picture.name))

@@ -24,18 +24,18 @@ _TELLING = {"bin": 1, "lfw": 1, "agedb": 1, "cfp": 3}
 
 @dataclass(frozen=True, eq=False, repr=False)
 class EmbeddingsFile:
-    """Descriptors with the paths of their photos.
+    """Embeddings with the paths of their photos.
 
     Parameters
     ----------
     paths
         As the file has them, all different.
-    descriptors : (N, n) float32
+    embeddings : (N, n) float32
         Unit rows.
     """
 
     paths: tuple[str, ...]
-    descriptors: NDArray[np.float32]
+    embeddings: NDArray[np.float32]
     sha256: str
 
     def __len__(self) -> int:
@@ -100,8 +100,8 @@ def read_content(file: Path) -> EmbeddingsFile:
     return EmbeddingsFile(tuple(names), unit, sha256)
 
 
-def match(embeddings: EmbeddingsFile, benchmark: VerificationSet) -> NDArray[np.int64]:
-    """Find the descriptor of every photo of a set.
+def match(file: EmbeddingsFile, benchmark: VerificationSet) -> NDArray[np.int64]:
+    """Find the embedding of every photo of a set.
 
     A photo takes the row of its exact name; else of its name without suffix; else the row that
     shares the longest end of its path: all of the shorter path, or as many components as tell
@@ -111,18 +111,17 @@ def match(embeddings: EmbeddingsFile, benchmark: VerificationSet) -> NDArray[np.
     Returns
     -------
     positions : (len(benchmark.pictures),) int64
-        Rows of ``embeddings.descriptors``; −1 for photos without one, which are failures to
-        acquire.
+        Rows of ``file.embeddings``; −1 for photos without one, which are failures to acquire.
 
     Raises
     ------
     DatasetError
         Several rows fit a photo equally well, or one row fits several photos.
     """
-    exact = {path: [row] for row, path in enumerate(embeddings.paths)}
+    exact = {path: [row] for row, path in enumerate(file.paths)}
     ends: defaultdict[tuple[str, ...], list[int]] = defaultdict(list)
     whole: defaultdict[tuple[str, ...], list[int]] = defaultdict(list)
-    for row, path in enumerate(embeddings.paths):
+    for row, path in enumerate(file.paths):
         pieces = _components(path)
         whole[pieces].append(row)
         for start in range(len(pieces)):
@@ -135,10 +134,10 @@ def match(embeddings: EmbeddingsFile, benchmark: VerificationSet) -> NDArray[np.
         name = picture.name
         rows = exact.get(name) or _longest(_components(name), ends, whole, telling)
         if len(rows) > 1:
-            shown = " and ".join(f"{embeddings.paths[row]!a}" for row in rows[:_SHOWN])
+            shown = " and ".join(f"{file.paths[row]!a}" for row in rows[:_SHOWN])
             faults.append(f"{name} may be {shown}")
         elif rows and takers.setdefault(rows[0], name) != name:
-            path = embeddings.paths[rows[0]]
+            path = file.paths[rows[0]]
             faults.append(f"{path!a} fits both {takers[rows[0]]} and {name}")
         elif rows:
             positions[place] = rows[0]

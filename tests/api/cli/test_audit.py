@@ -69,7 +69,7 @@ def faces(world: World, tmp_path_factory: pytest.TempPathFactory) -> FaceAudit:
 
         def recorded(*given: Any, **named: Any) -> Any:
             extraction = plain(*given, **named)
-            found.append(extraction.descriptors)
+            found.append(extraction.embeddings)
             return extraction
 
         patch.setattr(audit_fairface, "extract", recorded)

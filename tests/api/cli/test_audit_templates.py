@@ -159,7 +159,7 @@ def test_what_two_attacks_found_becomes_report_verdict_and_status(
     bed = bed_of("pool")
 
     def two_attacks(plan: AuditPlan, faces: Extraction, *_: Any, **__: Any) -> AuditResult:
-        assert (plan.victims, len(faces.descriptors)) == (20, 20)
+        assert (plan.victims, len(faces.embeddings)) == (20, 20)
         # Those of the contract in data_dir, where nothing else is asked for.
         assert (plan.dims, plan.strategy) == ((DIM,), Strategy.ADVERSARIAL)
         outcomes = [*run_attack(foot_point, bed), *run_attack(known_pool, bed)]

@@ -111,7 +111,7 @@ def test_of_faces_that_look_alike_the_first_stays() -> None:
     paths = [Path(f"{number}.jpg") for number in range(4)]
     kept = without_lookalikes(Extraction(rows, paths, [], cached=0))
     assert [path.name for path in kept.paths] == ["0.jpg", "1.jpg", "3.jpg"]
-    np.testing.assert_array_equal(kept.descriptors, rows[[0, 1, 3]])
+    np.testing.assert_array_equal(kept.embeddings, rows[[0, 1, 3]])
 
 
 def test_copies_among_thousands_are_dropped() -> None:

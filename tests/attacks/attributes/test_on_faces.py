@@ -27,7 +27,7 @@ def labelled(root: Path, part: str, count: int, extractor: Extractor) -> Labelle
     faces = extractor.extract(photos)
     names = [f"{part}/{Path(str(path)).name}" for path in faces.paths]
     columns = {name: [str(each) for each in labels.column(name, names)] for name in CLASSES}
-    return LabelledFaces.of_names(faces.descriptors, columns, CLASSES)
+    return LabelledFaces.of_names(faces.embeddings, columns, CLASSES)
 
 
 @pytest.fixture(scope="module")

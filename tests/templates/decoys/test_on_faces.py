@@ -48,7 +48,7 @@ def faces(lfw_aligned: Path, yunet_pack_dir: Path) -> Faces:
     chosen = [path for person in people[:SUBJECTS] for path in person[:3]]
     others = [p[0] for p in photos_of.values() if len(p) < 3][: FITTED + UNSEEN]
     extractor = Extractor(ModelPack.load(yunet_pack_dir), aligned=True)
-    rows = extractor.extract([*chosen, *others]).descriptors
+    rows = extractor.extract([*chosen, *others]).embeddings
     assert len(rows) == 3 * SUBJECTS + FITTED + UNSEEN
     subjects, rest = rows[: 3 * SUBJECTS], rows[3 * SUBJECTS :]
     return Faces(rest[:FITTED], subjects, np.vstack([subjects[::3], rest[FITTED:]]))

@@ -48,9 +48,9 @@ def test_rows_become_unit(tmp_path: Path, dtype: str, compressed: bool) -> None:
     assert read.sha256 == hashlib.sha256(file.read_bytes()).hexdigest()
     wide = rows.astype(np.float64)
     expected = wide / np.linalg.norm(wide, axis=1, keepdims=True)
-    np.testing.assert_allclose(read.descriptors, expected, atol=1e-7)
-    assert read.descriptors.dtype == np.float32
-    assert read.descriptors.flags.c_contiguous
+    np.testing.assert_allclose(read.embeddings, expected, atol=1e-7)
+    assert read.embeddings.dtype == np.float32
+    assert read.embeddings.flags.c_contiguous
 
 
 PATHS = np.array(["a", "b", "c"])

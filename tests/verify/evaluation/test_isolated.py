@@ -82,7 +82,7 @@ def test_an_archive_that_unpacks_to_much_is_refused(
         read_embeddings(file)
     rows = np.eye(2, 4)
     np.savez(file, paths=np.array(["a", "b"]), descriptors=2 * rows)
-    np.testing.assert_array_equal(read_embeddings(file).descriptors, rows)
+    np.testing.assert_array_equal(read_embeddings(file).embeddings, rows)
 
 
 @pytest.mark.parametrize("seed", [*range(4), *(pytest.param(k, marks=LONG) for k in range(4, 40))])
