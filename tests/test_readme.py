@@ -116,10 +116,9 @@ def test_the_real_path_from_weights_to_a_receipt(
     finally:
         server.terminate()
         server.wait(timeout=PATIENCE_S)
-    answer, _ = json.JSONDecoder().raw_decode(answers, answers.index('{"decision"'))
+    (answer,) = (json.loads(part) for part in re.findall(r'\{[^{}]*"decision"[^{}]*\}', answers))
     (shown,) = re.findall(r"^```json\n(.*?)^```", README, flags=re.M | re.S)
     example = json.loads(shown)
-    assert list(answer) == list(example)
     assert {**example, **ids_of(answer)} == answer
 
 
@@ -159,7 +158,9 @@ def test_the_results_table_is_that_of_the_results_in_the_repository() -> None:
 def ids_of(answer: dict[str, str]) -> dict[str, str]:
     """What differs from call to call, and from contract to contract."""
     return {
-        name: value for name, value in answer.items() if name.endswith("_id") or name == "distance"
+        name: value
+        for name, value in answer.items()
+        if name.endswith("_id") or name.startswith("distance")
     }
 
 
