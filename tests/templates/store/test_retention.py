@@ -92,6 +92,15 @@ def test_the_limit_itself_is_not_over_it(store: TemplateStore, clock: Clock) -> 
     )
 
 
+def test_age_counts_from_the_latest_enrollment(store: TemplateStore, clock: Clock) -> None:
+    put(store, "ada", b"wire")
+    clock.pass_by(days=90)
+    put(store, "ada", b"wire")
+    clock.pass_by(days=10)
+    use(store, "ada")
+    assert store.retention.due(Retention(50 * DAY, 5 * DAY)) == 0
+
+
 def test_it_is_the_ordinary_erasure(store: TemplateStore, clock: Clock) -> None:
     put(store, "ada", b"wire")
     put(store, "ada", b"wire", tenant="other")
