@@ -8,6 +8,7 @@ from typing import Any
 
 from api.demo.people import Scale
 from api.demo.run import run_demo
+from api.demo.storage import KEY_FILE
 from api.service.opening import file_sealer, open_keyring
 from api.settings import Settings
 from models.pack import ModelPack
@@ -38,7 +39,10 @@ def demo_service(folder: Path) -> Iterator[Served]:
     assert outcome.faults == ()
     token = (folder / "api-key").read_text().strip()
     config = str(folder / "veilface.toml")
-    settings = Settings(data_dir=folder, pack=folder / "pack", demo=True)
+    master_key = folder / KEY_FILE
+    settings = Settings(
+        data_dir=folder, pack=folder / "pack", demo=True, master_key_file=master_key
+    )
     file, sealer = settings.resolved_contract_file, file_sealer(open_keyring(settings))
     # Their own templates score above 4.3, strangers' below 2.9 (20,000 templates).
     _beyond_chance(Contract.load(file, sealer), 3.9).save(file, sealer)
