@@ -19,15 +19,15 @@ def read(file: Path) -> tuple[str, tuple[str, ...], np.ndarray]:
         settings=cast("Settings", None),
         cache=None,
     )
-    return faces.name, faces.people, faces.descriptors
+    return faces.name, faces.people, faces.embeddings
 
 
 def test_an_archive_names_people_by_their_folder(tmp_path: Path) -> None:
     rows = np.array([[3.0, 4.0], [0.0, 2.0]], dtype=np.float16)
     np.savez(tmp_path / "more.npz", paths=np.array(["ada/1.jpg", "2.jpg"]), descriptors=rows)
-    name, people, descriptors = read(tmp_path / "more.npz")
+    name, people, embeddings = read(tmp_path / "more.npz")
     assert (name, people) == ("more.npz", ("ada", ""))
-    np.testing.assert_allclose(descriptors, [[0.6, 0.8], [0.0, 1.0]], atol=1e-6)
+    np.testing.assert_allclose(embeddings, [[0.6, 0.8], [0.0, 1.0]], atol=1e-6)
 
 
 def test_what_is_no_archive_is_refused(tmp_path: Path) -> None:
