@@ -12,12 +12,11 @@ import httpx
 import pytest
 from playwright.sync_api import Browser, Page, Route, expect
 
-from benchmarks.browser_client import faces_of, requests_in
-from benchmarks.people import Person
 from models.pack import ModelPack
 from tests.clients.conftest import Running
 from tests.clients.javascript.conftest import PACKAGE, require_client
 from tests.clients.proxy import Proxy
+from tests.clients.recorded import faces_of, requests_in
 from tests.examples.conftest import EXAMPLES, PYTHON, clean_environment, node, running
 from tests.leaks import as_bytes
 from tests.patience import PATIENCE_S, wait_until
@@ -433,8 +432,7 @@ def test_a_browser_sends_a_private_template_and_nothing_else_of_a_face(
         assert all(url.startswith(place.service.url) for url in tab.strays())
         assert tab.violations() == tab.complaints == []
 
-        persons = [Person(WHO, own[:1], []), Person(OTHER, other[:1], [])]
-        search = faces_of(pack, persons, shown)
+        search = faces_of(pack, {WHO: own[:1], OTHER: other[:1]}, shown)
         assert search.find(to_app + to_service) == []
         embedding = pack.embed_photo(shown["camera at login"]).embedding
         for recording, data, what in (
