@@ -318,7 +318,7 @@ def walk_passkeys(tab: BrowserTab, local: Served) -> Iterator[str]:
         yield "passkey-enrolled"
         tab.open("Verify")
         tab.name_person(SUBJECT)
-        tab.choose_drawn(PERSON, 4)
+        tab.choose_drawn(PERSON, 5)
         tab.press("Verify")
         tab.is_decided("accept")
         yield "passkey-accepted"
