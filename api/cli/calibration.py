@@ -163,7 +163,9 @@ def operating_point(
     plain = plain_strategy(strategy)
     uncovered = None
     if isinstance(source, DecoyPool):
-        uncovered = "who has the pool finds the decoys, and no attack of a calibration has it"
+        uncovered = (
+            "an attacker with the pool finds the decoys, and no attack of a calibration has it"
+        )
     elif plain is not strategy:
         uncovered = f"the attacks are on {plain} lifting, not on what {strategy} chooses by"
     return choose_and_judge(

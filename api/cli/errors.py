@@ -78,8 +78,7 @@ def _missing(package: str, extra: str) -> str:
 
 def sentence(error: Exception) -> str:
     """Say what is wrong, without a value that may be private."""
-    # By name: the libraries of databases and models take seconds to import, and whoever has their
-    # errors has them already.
+    # By name: the libraries of databases and models take seconds to import.
     kinds = {f"{kind.__module__}.{kind.__name__}" for kind in type(error).__mro__}
     if isinstance(error, VeilfaceError) or "models.errors.ModelError" in kinds:
         return str(error)

@@ -78,7 +78,7 @@ def chosen_device(device: str, *, here: bool = True) -> str | None:
         return None
     if not here:
         return device
-    # Imported here: whoever leaves the flag out starts sooner.
+    # Imported here: a command without the flag starts sooner.
     from templates.distances import require_device
 
     try:

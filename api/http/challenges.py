@@ -89,7 +89,8 @@ def opened_challenge(
     Raises
     ------
     ApiError
-        ``validation_failed`` where it is none of this service, tenant, subject and token.
+        ``validation_failed`` where it was made elsewhere, or for another tenant, subject or
+        token.
     Replayed
         Where it has expired.
     """

@@ -66,7 +66,7 @@ def _holder_key(value: Any) -> bytearray:
     try:
         return decode_holder_key(value)
     except SealError as error:
-        raise ValueError(f"is none: {error}") from None
+        raise ValueError(f"is no holder key: {error}") from None
 
 
 def _embedding(value: Any) -> NDArray[np.float64]:

@@ -181,7 +181,7 @@ def listen(settings: Settings) -> socket.socket:
     Raises
     ------
     StartError
-        The address is taken, or is none of this machine.
+        The address is taken, or is not this machine's.
     """
     family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
     listener = socket.socket(family, socket.SOCK_STREAM)

@@ -1,7 +1,7 @@
 """An OpenID Connect provider whose login is a face: authorization code with PKCE, ES256.
 
-One process, which keeps in memory who logged in and has not come for the ID token yet. Whoever did
-not log in leaves nothing in it. docs/login.md says how to run it and what it leaves to you.
+One process. It keeps a login in memory until its ID token is fetched, and nothing of a person who
+did not log in. docs/login.md says how to run it and what it leaves to you.
 """
 
 import base64

@@ -111,7 +111,7 @@ def theft(faces: int | None, found: Rate) -> Recovery:
         (300, 1000, 16, None, "FAIL"),
         (99, 1000, 0, None, "NOT SHOWN"),
         (100, 999, 0, None, "NOT SHOWN"),
-        (300, 5000, 0, "who has the pool finds the decoys", "NOT SHOWN"),
+        (300, 5000, 0, "an attacker with the pool finds the decoys", "NOT SHOWN"),
     ],
 )
 def test_a_verdict_passes_only_what_is_shown(
