@@ -319,7 +319,6 @@ def test_hybrid_plus_takes_attributes_and_does_without() -> None:
         binding=make_binding(pool.source_id, strategy=Strategy.HYBRID_PLUS, axes=N),
         source=pool,
         options=CalibrationOptions(targets=(1e-1,)),
-        attributes=[labels[0]] * len(people.names),
     )
     contract = dataclasses.replace(result.contract, photo_consistency=-1.0)
     rotation = tenant_rotation(N)

@@ -186,7 +186,7 @@ def test_a_wrong_label_is_named(world: World, fairface_root: Path, tmp_path: Pat
     wrong = text.replace("20-29", "adult", 1)
     (tmp_path / "fairface_label_train.csv").write_text(wrong)
     ran = fairface(world, tmp_path, *SMALL)
-    refused(ran, "fairface_label_train.csv, line 3: the age is none of", 1)
+    refused(ran, "fairface_label_train.csv: line 3: the age is none of", 1)
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ def test_a_program_prints_what_it_says(
     with Client(service.url, service.deployment.token) as client:
         for subject in list(client.subjects()):
             client.erase(subject.subject_id)
-    for shot in range(1, 4):
+    for shot in range(1, 6):
         (tmp_path / f"anna{shot}.jpg").write_bytes(photo(1, shot))
         (tmp_path / f"emil{shot}.rgb").write_bytes(picture(9, shot).tobytes())
     (tmp_path / "embedder.onnx").symlink_to(service.pack / "tiny.onnx")
