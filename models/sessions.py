@@ -175,7 +175,7 @@ def _load(model: bytes, name: str, providers: list[str], threads: int | None) ->
             f" in another file, convert it to a single one. onnxruntime says: {error}"
         ) from error
     session.disable_fallback()
-    # It keeps the bytes to load them again elsewhere, which is switched off.
+    # It keeps the bytes for a fallback to another provider, and no session here falls back.
     vars(session).pop("_model_bytes", None)
     running = session.get_providers()
     missing = [provider for provider in providers if provider not in running]

@@ -2,6 +2,7 @@
 
 import csv
 import hashlib
+import io
 from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -301,7 +302,7 @@ def csv_rows(
         Naming the first fault: a column that is absent, unknown, without a name or there twice; a
         line that is no CSV, or has more or fewer cells than there are columns.
     """
-    reader = csv.reader(text.splitlines(keepends=True), strict=True)
+    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
     rows = []
     try:
         header = [cell.strip().lower() for cell in next(reader, [])]

@@ -32,7 +32,7 @@ class Decision:
         climb (docs/method.md §4.8). Left out of ``repr``, so that no log line holds them by
         accident.
     distance_threshold
-        The distance at which this very probe reaches the level's threshold, which is of scores.
+        The distance at which this probe would just be accepted; the threshold itself is a score.
     liveness
         Whether a living person made the probe, where that was checked.
     liveness_failure

@@ -49,7 +49,7 @@ from api.http.routes.page import page_routes
 from api.http.routes.reference import document_routes, reference_routes
 from api.limits.admission import Gate
 from api.limits.rates import RateLimits
-from api.service.allocator import give_back, keep_few_arenas
+from api.service.allocator import give_back
 from api.service.housekeeping import purge_regularly
 from api.service.logging import configure, log
 from api.service.metrics import count_lockout, forget_dead_workers, set_build
@@ -117,7 +117,7 @@ CORS_ANSWER_HEADERS = (
 def create_app(
     settings: Settings, *, open_runtime: Callable[[Settings], Runtime] = Runtime.open
 ) -> FastAPI:
-    """Make the application; what the settings name is opened when the server starts it."""
+    """Make the application; ``open_runtime`` gives what answers when the server starts it."""
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -208,7 +208,6 @@ async def _open(
     running: AsyncExitStack,
 ) -> None:
     """Open what answers requests; ``running`` closes it again, the last one first."""
-    keep_few_arenas(settings.resolved_compute_slots)
     # Requests compute beside each other, as many as there are slots. Threads of the matrix library
     # would only wait for each other, and burn processor time while they do.
     running.enter_context(single_threaded())

@@ -2,10 +2,10 @@
 
 ::
 
-    settings ─▶ open_keyring ─▶ open_store           enough for keys and db
-                     └────────▶ open_contract ┐
-                                open_decoys   ├─▶ Runtime.enroller / .verifier (tenant, epoch)
-                                open_pack     ┘
+    settings ─▶ open_keyring ─▶ open_store    ┐ enough for keys and db
+                     └────────▶ open_contract ├─▶ Deployment ┐
+                                open_decoys   ┘              ├─▶ Runtime
+                                open_pack ───────────────────┘     .enroller / .verifier
 """
 
 import contextlib
@@ -17,6 +17,7 @@ from typing import Literal, Self
 from api.http.errors import ApiError
 from api.http.policy import Levels, LivenessRules
 from api.http.transfer import Exported, ExportKey, seal_export
+from api.service.allocator import keep_few_arenas
 from api.service.opening import (
     Deployment,
     open_contract,
@@ -90,6 +91,7 @@ class Runtime(Deployment):
     @classmethod
     def open(cls, settings: Settings, *, contract: Contract | None = None) -> Self:
         """Open what the settings name, the pack before the database, and run one inference."""
+        keep_few_arenas(settings.resolved_compute_slots)
         contract = contract or open_contract(settings, open_keyring(settings))
         pack = open_pack(settings, contract)
         if pack is not None:

@@ -58,6 +58,10 @@ class Rate(JsonValue):
     ci_high: Share
     interval: Interval = "wilson"
 
+    def __post_init__(self) -> None:
+        if self.errors > self.trials:
+            raise ContractError("a rate counts more errors than trials")
+
     @property
     def value(self) -> float:
         """Errors over trials; 0 where nothing was tried."""
@@ -186,6 +190,10 @@ class Calibration(JsonValue):
     calibrated_on: Mapping[str, Json] = field(default_factory=dict)
     probe_photos: Annotated[int, Field(ge=1, le=MAX_PROBE_PHOTOS)] = 1
     calibration_id: str = ""
+
+    def __post_init__(self) -> None:
+        if len({level.name for level in self.levels}) < len(self.levels):
+            raise ContractError("two levels of a calibration bear one name")
 
     def level(self, name: str) -> Level:
         """Find a level by name.

@@ -49,9 +49,7 @@ class LivenessCalibration(JsonValue):
     threshold: float
     bpcer: Rate
     target_bpcer: Annotated[float, Field(gt=0, lt=1)]
-    apcer: Mapping[Annotated[str, Field(pattern=f"^{SPECIES_NAME.pattern}$")], Rate] = field(
-        default_factory=dict
-    )
+    apcer: Mapping[Species, Rate] = field(default_factory=dict)
     calibrated_on: Mapping[str, Json] = field(default_factory=dict)
 
     @property

@@ -75,7 +75,7 @@ class Judgement(JsonValue):
     @property
     def status(self) -> Status:
         """``PASS`` where the rate and its upper bound are within limits, and the data show it."""
-        if self.shortfall is not None:
+        if self.shortfall is not None or not self.rate.trials:
             return "NOT SHOWN"
         if self.rate.value > self.limit:
             return "FAIL"

@@ -60,7 +60,7 @@ def tiles(
     """Yield rows, columns and distances (R, C) of all parts of the matrix of every pair.
 
     ``dtype`` is that of the inner products of subspaces on the sphere: float32 leaves an error of
-    10⁻⁶ in a similarity, and reads a batch of templates as it lies.
+    10⁻⁶ in a similarity.
     """
     if isinstance(probes, SubspaceBatch) and metric is Metric.SPHERICAL:
         most = max(1, _CHUNK_BYTES // (8 * probes.m * templates.m))
@@ -236,7 +236,9 @@ def _spherical_tile(
     left = probes.bases.reshape(-1, n).astype(dtype, copy=False)
     right = templates.bases.reshape(-1, n)
     # The rows of the larger subspaces are read once.
-    products = (left @ np.concatenate([right, q]).astype(dtype).T).astype(np.float64)
+    products = (left @ np.concatenate([right.astype(dtype, copy=False), q.astype(dtype)]).T).astype(
+        np.float64
+    )
     products = products.reshape(shape[0], probes.m, -1).transpose(0, 2, 1)
     b = products[:, : len(right)].reshape(*shape, templates.m, probes.m).swapaxes(2, 3)
     g = products[:, len(right) :]

@@ -21,7 +21,7 @@ from templates.store.tenants import ROTATION_PURPOSE
 
 
 class Wrapped(NamedTuple):
-    """A table with blobs under the master key: their column and purpose, what they are bound to."""
+    """A table, its column that is sealed with the master key, and what the seal is bound to."""
 
     table: type[Base]
     blob: str

@@ -5,9 +5,9 @@ The order of a verification, which is what bounds an attacker::
     body read ─▶ level, liveness ─▶ one read: used? locked out? template ─▶ probe ─▶ decision
         ─▶ one write: token used up, lockout checked and counted, audit line ─▶ answer
 
-A locked subject's photo is not looked at. The lock is read first, and it is on those who are
-enrolled and on those who are not. A template, or the stand-in, is opened before the photo is looked
-at, so that the time of a photo that is refused does not tell them apart either.
+A locked subject's photo is not looked at. The lock is read first, and a subject id is locked
+whether or not somebody is enrolled under it. A template, or the stand-in, is opened before the
+photo is looked at, so that the time of a refused photo does not tell the two apart either.
 
 No decision leaves before that write has committed. So of requests that run at the same time
 no more are answered than of requests that come one after the other.

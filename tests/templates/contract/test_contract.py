@@ -112,6 +112,14 @@ def make_contract(**changes: Any) -> Contract:
     return Contract(**{**fields, **changes})
 
 
+def test_counts_and_names_that_contradict_each_other_are_refused() -> None:
+    with pytest.raises(ContractError, match="more errors than trials"):
+        Rate(errors=3, trials=2, ci_low=0.5, ci_high=1.0)
+    twice = make_calibration().levels[:1] * 2
+    with pytest.raises(ContractError, match="bear one name"):
+        make_calibration(levels=twice)
+
+
 # --- ids -----------------------------------------------------------------------------------
 
 

@@ -31,6 +31,7 @@ def test_the_upper_bound_is_exact(errors: int, trials: int, bound: float) -> Non
         (Judgement(rate(5, 100), 0.05, bound=0.1), "NOT SHOWN", True),
         (Judgement(rate(15, 300), 0.05, bound=0.1), "PASS", True),
         (Judgement(rate(0, 300), 0.05, bound=0.1, shortfall="few faces"), "NOT SHOWN", True),
+        (Judgement(rate(0, 0), 0.05), "NOT SHOWN", True),
     ],
 )
 def test_a_rate_passes_up_to_its_limit_where_its_bound_is_within(

@@ -76,9 +76,10 @@ def test_ages_in_years_are_put_into_groups(tmp_path, years, group):
 
 def test_cells_may_hold_commas_and_rows_may_repeat(tmp_path):
     labels = read_labels(
-        written(tmp_path, 'path,race\n"Lee, Ann",Black\n\n"Lee, Ann",Black\n , \n')
+        written(tmp_path, 'path,race\n"Lee, Ann",Black\n\n"Lee, Ann",Black\n , \nO\u2028N,White\n')
     )
     assert labels.find("Lee, Ann/1.jpg") == {"race": "Black"}
+    assert labels.find("O\u2028N/1.jpg") == {"race": "White"}
 
 
 @pytest.mark.parametrize(
