@@ -65,8 +65,7 @@ def fairface(
         Path,
         typer.Argument(
             metavar="ROOT",
-            help="FairFace: a folder with `fairface_label_train.csv`, `fairface_label_val.csv` "
-            "and the photos that they name.",
+            help="FairFace: a folder with its two label files and the photos that they name.",
         ),
     ],
     *,
@@ -98,8 +97,7 @@ def fairface(
     generated_dim: Annotated[
         str,
         typer.Option(
-            help="Dimensions of adversarial lifting with generated decoys, as the service does "
-            "by default, beside --service-dim."
+            help="Dimensions of adversarial lifting with generated decoys, beside --service-dim."
         ),
     ] = ",".join(map(str, OUR_DIMS)),
     attackers: Annotated[str, typer.Option(help="Who attacks; `knn` is the paper's.")] = ",".join(
@@ -111,32 +109,31 @@ def fairface(
         typer.Option(
             min=0.0,
             max=1.0,
-            help="Do not attack faces that resemble a training face to this cosine, such as 0.8: "
-            "FairFace has near-duplicates.",
+            help="Leave out near-duplicates: faces that resemble a training face to this cosine, "
+            "such as 0.8.",
         ),
     ] = None,
     decoys: Annotated[
         Path | None,
         typer.Option(
-            help="The decoy generator that the service uses. Unset: `decoys.veil` in `data_dir` "
-            "where it is one of this pack, else one that is fitted to the lifting database."
+            help="The service's decoy generator. Unset: `decoys.veil` in `data_dir` where it is "
+            "of this pack, else one fitted to the lifting database."
         ),
     ] = None,
     axes: Annotated[
         int | None,
         typer.Option(
             min=2,
-            help="Axes of faces that embeddings are projected on for generated decoys. Unset: as "
-            "by the contract in `data_dir` where it is of these decoys, else all.",
+            help="Axes that embeddings are projected on for generated decoys. Unset: those of the "
+            "contract, else all.",
         ),
     ] = None,
     service_dim: Annotated[
         int | None,
         typer.Option(
             min=1,
-            help="The dimension that the verdict is on, of adversarial lifting with generated "
-            "decoys; the other schemes are compared with it. Unset: that of the contract in "
-            f"`data_dir` where it is of these decoys, else {DEFAULT_DIM}.",
+            help="Dimension, with generated decoys, that the verdict is on; other schemes are "
+            f"compared with it. Unset: that of the contract, else {DEFAULT_DIM}.",
         ),
     ] = None,
     seed: Seed = 0,
@@ -153,8 +150,8 @@ def fairface(
     """Infer gender, race and age from templates: the paper's experiment, and stronger attackers.
 
     Writes report.json, report.md, figures, the paper's among them, and report.html, which has all
-    to read in one file, to --out. Exit status 1: the strongest attacker exceeds the limit. Exit
-    status 3: none does, and too few faces show it.
+    in one file, to --out. "The contract" is that in `data_dir` where it is of these decoys. Exit
+    status 1: the strongest attacker exceeds the limit; 3: none does, and too few faces show it.
     docs/privacy.md explains every figure.
 
     Example: `veilface audit fairface fairface --pack buffalo_l --out audit`

@@ -27,7 +27,7 @@ from templates.keys.sealing import Sealer
 from verify.preparation import recorded_of
 
 Out = Annotated[Path, typer.Option(help="Folder of the report.")]
-Seed = Annotated[int, typer.Option(min=0, help="Seed for everything random.")]
+Seed = Annotated[int, typer.Option(min=0, help="Seed for the random choices.")]
 
 NOT_SHOWN = 3
 """Exit status where nothing fails, and not everything is shown to hold."""

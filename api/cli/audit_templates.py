@@ -57,8 +57,8 @@ def templates(
         Path,
         typer.Argument(
             metavar="PEOPLE",
-            help="Labelled faces: one subfolder for each person, with photos in it (as LFW has "
-            "them). Victims and decoy owners need two photos or more.",
+            help="Labelled faces, one subfolder for each person; only people with two photos or "
+            "more are attacked or own decoys.",
         ),
     ],
     *,
@@ -66,47 +66,42 @@ def templates(
     limits: Mapping[str, float],
     decoys: Annotated[
         Path | None,
-        typer.Option(
-            help="The file of `decoys build` that the service uses. Unset: `decoys.veil` in "
-            "`data_dir`."
-        ),
+        typer.Option(help="The service's decoys. Unset: `decoys.veil` in `data_dir`."),
     ] = None,
     fit_decoys: Annotated[
         bool,
         typer.Option(
             "--fit-decoys",
-            help="Fit the decoys to people of PEOPLE who play no other part, in place of --decoys: "
-            "what decoys of the same kind of people and photos would give.",
+            help="Instead of --decoys, fit decoys to people of PEOPLE who play no other part: "
+            "decoys of the same kind of people and photos.",
         ),
     ] = False,
     contract: Annotated[
         Path | None,
         typer.Option(
-            help="Audit the service of this contract: its strategy, dimension, thresholds and "
-            "cohort. Unset: each scheme is calibrated on people of PEOPLE who are not attacked."
+            help="Audit this contract, with its thresholds and cohort. Unset: each scheme is "
+            "calibrated on people of PEOPLE who are not attacked."
         ),
     ] = None,
     strategy: Annotated[
         Strategy | None,
         typer.Option(
-            help="How templates are lifted; not with --contract. Unset: as by the contract in "
-            "`data_dir` where it is of these decoys, else adversarial."
+            help="How templates are lifted. Unset: that of the contract, else adversarial."
         ),
     ] = None,
     dim: Annotated[
         str | None,
         typer.Option(
-            help="Dimensions m of templates, such as 16,32; not with --contract. Unset: that of "
-            f"the contract in `data_dir` where it is of these decoys, else {DEFAULT_DIM}."
+            help="Dimensions m of templates, such as 16,32. Unset: that of the contract, else "
+            f"{DEFAULT_DIM}."
         ),
     ] = None,
     axes: Annotated[
         int | None,
         typer.Option(
             min=2,
-            help="Axes of faces that embeddings are projected on; not with --contract. Unset: as "
-            "by the contract in `data_dir` where it is of these decoys, else those with 83 % of "
-            "the decoys' variance.",
+            help="Axes that embeddings are projected on. Unset: those of the contract, else those "
+            "with 83 % of the decoys' variance.",
         ),
     ] = None,
     victims: Annotated[int, typer.Option(min=20, help="People who are attacked.")] = 300,
@@ -114,14 +109,14 @@ def templates(
         int,
         typer.Option(
             min=LEAST_FITTED,
-            help="People who make up the pool of real decoys that is compared with.",
+            help="People whose faces are the real decoys of the comparison.",
         ),
     ] = 600,
     comparison: Annotated[
         bool,
         typer.Option(
-            help="Attack templates with decoys of real people too, to compare with and to show "
-            "that the attacks work."
+            help="Attack templates with decoys of real people too, which shows that the attacks "
+            "work."
         ),
     ] = True,
     climbed: Annotated[
@@ -134,8 +129,7 @@ def templates(
         bool | None,
         typer.Option(
             "--learned/--no-learned",
-            help="Train an inverter from template to embedding (needs the extra `torch`). Unset: "
-            "where torch is installed.",
+            help="Train an inverter (extra `torch`). Unset: where torch is installed.",
         ),
     ] = None,
     training_seconds: Annotated[
@@ -145,8 +139,8 @@ def templates(
         list[Path] | None,
         typer.Option(
             help="Further faces that the attacker has: a folder of photos, or a `.npz` with "
-            "`paths` and `descriptors` of the same pack. May be given several times. Photos of "
-            "victims, and people who are named like them, are left out."
+            "`paths` and `descriptors` of the same pack. May be repeated. Photos of victims and "
+            "of their namesakes are left out."
         ),
     ] = None,
     seed: Seed = 0,
@@ -162,10 +156,10 @@ def templates(
 ) -> Result:
     """Attack private templates: inversion, linkage, renewal, impersonation, climbing.
 
-    Writes report.json, report.md, figures and report.html, which has all to read in one file, to
-    --out. Every attack says what the attacker is assumed to have. Exit status 1: an attack exceeds
-    its limit. Exit status 3: none does, and too few people or faces show it. docs/privacy.md leads
-    to what each attack is.
+    Writes report.json, report.md, figures and report.html, which has all in one file, to --out.
+    Without --contract, --strategy, --dim and --axes are those of the contract in `data_dir` where
+    it is of these decoys. Exit status 1: an attack exceeds its limit; 3: none does, and too few
+    people or faces show it. docs/privacy.md leads to what each attack is.
 
     Example: `veilface audit templates lfw --pack buffalo_l --decoys decoys.veil --out audit`
     """

@@ -59,7 +59,7 @@ def distances(
         typer.Option(min=1, help="Threads of distances and products. Unset: the library's."),
     ] = None,
     device: Device = PROCESSOR,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the embeddings.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed for the random choices.")] = 0,
 ) -> Result:
     """Time all distances between probes and templates, beside the bare matrix product.
 

@@ -44,8 +44,8 @@ def calibrate(
     folder: Annotated[
         Path | None,
         typer.Argument(
-            help="Labelled faces: one subfolder for each person, as in LFW. Or faces that nobody "
-            "labelled, in no subfolder: each photo counts as another person. Not with --liveness."
+            help="Labelled faces, one subfolder for each person. Or faces that nobody labelled, "
+            "in no subfolder: each photo counts as another person. Not with --liveness."
         ),
     ] = None,
     *,
@@ -99,15 +99,14 @@ def calibrate(
     exclude_people: Annotated[
         Path | None,
         typer.Option(
-            help="People to leave out, such as those in a test: a folder whose subfolders are "
-            "named like them, or a text file with a name on each line."
+            help="People to leave out, such as those of a test: a folder with a subfolder for "
+            "each, or a text file with a name on each line."
         ),
     ] = None,
     aliases: Annotated[
         Path | None,
         typer.Option(
-            help="People who appear under two names: a text file, `second name,first name` on each "
-            "line."
+            help="People under two names: a text file, `second name,first name` on each line."
         ),
     ] = None,
     labels: Annotated[
@@ -128,8 +127,7 @@ def calibrate(
         bool,
         typer.Option(
             "--worst-group",
-            help="Set every level so that the FMR keeps its target within each group, too, if the "
-            "group has enough trials.",
+            help="Levels keep their FMR within each group, too, that has enough trials.",
         ),
     ] = False,
     photos: Annotated[
@@ -138,8 +136,8 @@ def calibrate(
     liveness: Annotated[
         Path | None,
         typer.Option(
-            help="Instead of people, live and perhaps attack photos, as for `evaluate liveness`: "
-            "sets the liveness threshold of the contract file, and changes nothing else in it."
+            help="Instead of people, photos as for `evaluate liveness`: sets only the liveness "
+            "threshold of the contract file."
         ),
     ] = None,
     bpcer: Annotated[

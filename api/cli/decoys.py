@@ -50,8 +50,8 @@ def build(
     like: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Folder of 300 photos or more of the kind of people who will be enrolled, but of "
-            "other people: the decoys are adapted to them. May be given several times."
+            help="Folder of 600 photos or more (at least 100 of 50 people) of further people of "
+            "the kind that will be enrolled: decoys are adapted to them. May be repeated."
         ),
     ] = None,
     out: Annotated[
@@ -84,7 +84,7 @@ def build(
             min=1, help="Take this many photos of SOURCE, chosen at random.", show_default=False
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of that choice.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed for the random choices.")] = 0,
     aligned: Aligned = False,
     flip: Flip = False,
     cache: Cache = None,

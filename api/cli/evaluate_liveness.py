@@ -65,7 +65,7 @@ def evaluate_liveness(
         str | None,
         typer.Option(help="Level of the whole verification. Unset: the contract's default."),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the templates.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed for the random choices.")] = 0,
     out: Annotated[Path, typer.Option(help="Folder of the results.")] = Path("liveness"),
     _plan: Plan = None,
 ) -> Result:

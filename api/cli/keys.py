@@ -219,10 +219,10 @@ def rotate_tenant(
     """Give a tenant a new rotation key, and turn its stored templates by it.
 
     Needs: the database, the key file and the contract; the service may run meanwhile. Nobody has
-    to enroll again, and the old key is dropped at the end. That is enough if only this key leaked.
-    If templates were stolen too, use `--stolen`: stored templates keep their old key, and the
-    people who must enroll again, with new photos, are listed. `--stolen --finish` shows who is
-    left, and drops the old key when nobody is; `--finish` alone would turn the stolen templates.
+    to enroll again, and the old key is dropped at the end. If templates were stolen too, use
+    `--stolen`: those who must enroll again, with new photos, are listed. `--stolen --finish` shows
+    who is left, and drops the old key when nobody is; `--finish` alone would turn the stolen
+    templates.
 
     Example: `veilface keys rotate-tenant --tenant default`
     """

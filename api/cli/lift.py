@@ -29,7 +29,7 @@ MAX_PHOTO_BYTES = 64 * 2**20
 def lift(
     photos: Annotated[
         list[Path],
-        typer.Argument(help=f"1 to {MAX_PHOTOS} photos of one person."),
+        typer.Argument(help=f"1 to {MAX_PHOTOS} photos of one person, which are averaged."),
     ],
     *,
     pack: Annotated[Path, typer.Option(help="The model pack of the contract.")],
@@ -72,8 +72,9 @@ def lift(
     face: Annotated[
         FacePolicy,
         typer.Option(
-            help="A photo with several faces: use the largest if it covers the middle and has "
-            "twice the area of every other; use the largest wherever it is; or refuse the photo."
+            help="Which face counts in a photo of several: `dominant`, the largest if it covers "
+            "the middle and has twice the area of every other; `largest`, wherever it is; "
+            "`single`, none."
         ),
     ] = FacePolicy.SINGLE,
     holder_key_file: Annotated[
@@ -87,9 +88,9 @@ def lift(
 
     Needs: the service's model pack, and `GET /v1/contract` and `GET /v1/contract/generator` saved
     to files. Send the result as `{"template": …}` with a key that has the right `embeddings`; to
-    enroll it, the tenant must allow templates (`veilface db template-enrollment`). Several photos
-    of one person are averaged. Never lift the same photo twice for an enrollment: two templates of
-    one embedding give it away. Keep the file like a password.
+    enroll it, the tenant must allow templates (`veilface db template-enrollment`). Never lift the
+    same photo twice for an enrollment: two templates of one embedding give it away. Keep the file
+    like a password.
 
     Example: `veilface lift me-1.jpg me-2.jpg --pack buffalo_l --generator generator.bin
     --contract contract.json --out me.veil`

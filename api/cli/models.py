@@ -72,9 +72,8 @@ def fetch(
 ) -> Result:
     """Fetch a pack from an address that you name, and check that it can be used.
 
-    Shows licence and size first, then the SHA-256. Veilface has no addresses of weights: take one
-    from the owner of the pack. Of an archive only `.onnx` files and `pack.toml` are unpacked. Exit
-    status 1: the pack cannot be fetched or used, and nothing of it is left.
+    Shows licence and size first, then the SHA-256. Of an archive only `.onnx` files and `pack.toml`
+    are unpacked. Exit status 1: the pack cannot be fetched or used, and nothing of it is left.
 
     Example: `veilface models fetch buffalo_sc --from https://example.org/buffalo_sc.zip`
     """

@@ -68,15 +68,15 @@ def setup(
         list[Path],
         typer.Option(
             help="Folder of photos of many other faces, of any kind, at any depth: decoys are "
-            "fitted to them. May be given several times."
+            "fitted to them. May be repeated."
         ),
     ],
     like: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Folder of 300 photos or more of further people of the kind that will be "
-            "enrolled, whom decoys are adapted to. Unset: people of PEOPLE whom the calibration "
-            "can spare."
+            help="Folder of 600 photos or more (at least 100 of 50 people) of further people of "
+            "the kind that will be enrolled: decoys are adapted to them. Unset: people of PEOPLE "
+            "whom the calibration can spare."
         ),
     ] = None,
     aligned: Aligned = False,
@@ -92,15 +92,14 @@ def setup(
     """Prepare a service from a model pack and folders of photos, and judge it.
 
     With --faces alone nobody has to be labelled. Thresholds then assume that users look like those
-    faces, and how many genuine photos are rejected is not measured.
+    faces, and how many genuine photos are rejected is not measured. So it is, too, where PEOPLE are
+    too few for any threshold.
 
     Makes the master key apart from the data, splits the people by the names of their folders so
     that no name is in two roles, builds the decoys, calibrates, makes an API key, and writes
-    `veilface.toml`, which `veilface serve` reads. What is there already is kept: a run that was
-    stopped goes on when it is started again. It ends with two lines on privacy and accuracy; the
-    service starts whatever they say. PEOPLE too few for any threshold are left aside, and
-    thresholds are set on --faces. Exit status 1: --faces are too few as well; or a settings file
-    that is there has `serve` start another service.
+    `veilface.toml`, which `veilface serve` reads. What is there already is kept, so a run that was
+    stopped goes on. The service starts whatever the verdict at the end. Exit status 1: --faces are
+    too few; or a settings file that is there has `serve` start another service.
 
     Example: `veilface setup --faces fairface/train --pack buffalo_l`
     """

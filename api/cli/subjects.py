@@ -41,8 +41,8 @@ Subject = Annotated[str, typer.Argument(help="Id of the person.")]
 Face = Annotated[
     FacePolicy,
     typer.Option(
-        help="A photo with several faces: use the largest if it covers the middle and has twice "
-        "the area of every other; use the largest wherever it is; or refuse the photo."
+        help="Which face counts in a photo of several: `dominant`, the largest if it covers the "
+        "middle and has twice the area of every other; `largest`, wherever it is; `single`, none."
     ),
 ]
 HolderKeyFile = Annotated[
@@ -103,10 +103,10 @@ def enroll(
 ) -> Result:
     """Enroll a person from photos, or replace their enrollment; or enroll many with --from.
 
-    Needs: what `serve` needs (contract, decoys, pack); the service may run meanwhile. All photos
-    must show the same person: three are better than one. Only the private template is stored. With
-    a holder's key it accepts nobody without that key, which is not stored: who loses the file
-    enrolls again. With --from, exit status 1 means that somebody was not enrolled; the others are.
+    Needs: what `serve` needs (contract, decoys, pack); the service may run meanwhile. Three photos
+    are better than one. Only the private template is stored. With a holder's key it accepts nobody
+    without that key, which is not stored: if the file is lost, the person enrolls again. With
+    --from, exit status 1 means that somebody was not enrolled; the others are.
 
     Example: `veilface enroll alice alice-1.jpg alice-2.jpg alice-3.jpg --pack buffalo_l`
     """
@@ -279,11 +279,10 @@ def verify(
 ) -> Result:
     """Check whether photos show a person; exit status 0 if accepted, 1 if rejected.
 
-    Several photos must show one person; they are averaged, and the right person is rejected less
-    often. Exit status 2 is wrong usage, such as a missing photo; 3 means that no decision was made,
-    and stderr says why. Needs: what `serve` needs; the service may run meanwhile. The decision goes
-    into the audit log; it neither counts towards the subject's lockout nor is stopped by it. An
-    enrollment that was made with a holder's key rejects everybody without the same one.
+    Several photos are averaged, which rejects the right person less often. Exit status 3 means that
+    no decision was made, and stderr says why. Needs: what `serve` needs; the service may run
+    meanwhile. The decision goes into the audit log; it neither counts towards the subject's lockout
+    nor is stopped by it. An enrollment with a holder's key rejects everybody without the same one.
 
     Example: `veilface verify alice now-1.jpg now-2.jpg now-3.jpg --pack buffalo_l --level fmr-1e-4`
     """

@@ -11,6 +11,7 @@ from api.cli.app import COMMANDS, load
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "cli.md"
 MARK = "<!-- Below, all is generated: python -m tests.api.cli.cli_page -->\n"
 HEAD = "| argument, option | meaning |\n|---|---|\n"
+JSON = "| `--json` |"
 SEVERAL = 3
 """An option that means the same in so many commands is explained once."""
 
@@ -36,6 +37,8 @@ def page() -> str:
     counts = Counter(row for command in commands.values() for row in rows(command))
     shared = {row for row, count in counts.items() if count >= SEVERAL}
     table = "".join(sorted(shared))
+    without = [f"`{' '.join(path)}`" for path, each in commands.items() if not takes_json(each)]
+    table += f"\nAll commands take `--json`, except {', '.join(without)}.\n"
     sections = "".join(section(*each, shared) for each in commands.items())
     return f"{head}{MARK}\n## Options of several commands\n\n{HEAD}{table}{sections}"
 
@@ -48,6 +51,10 @@ def rows(command: Any) -> list[str]:
         if getattr(parameter, "rich_help_panel", None) != "Settings"
         and (flags := flags_of(parameter))
     ]
+
+
+def takes_json(command: Any) -> bool:
+    return any(row.startswith(JSON) for row in rows(command))
 
 
 def flags_of(parameter: Any) -> list[str]:
@@ -69,7 +76,11 @@ def section(path: tuple[str, ...], command: Any, shared: set[str]) -> str:
     calls = "\n".join(" ".join(call.split()) for call in re.findall(r"`(veilface[^`]+)`", example))
     text += f"```sh\n{calls}\n```"
     own = [row for row in rows(command) if row not in shared]
-    also = [row.split("|")[1].strip() for row in rows(command) if row in shared]
+    also = [
+        row.split("|")[1].strip()
+        for row in rows(command)
+        if row in shared and not row.startswith(JSON)
+    ]
     if own:
         text += f"\n\n{HEAD}" + "".join(own).rstrip("\n")
     if also:
