@@ -73,7 +73,12 @@ _CODES = (
         "else, the tenant forbids it, or liveness is asked for and the probe cannot show it.",
     ),
     ErrorCode("not_enrolled", 404, "Nobody is enrolled under this id."),
-    ErrorCode("not_found", 404, "There is nothing at this path."),
+    ErrorCode(
+        "not_found",
+        404,
+        "There is nothing at this path, or nothing to give: no failed attempts, generator, graph, "
+        "challenge or export.",
+    ),
     ErrorCode("method_not_allowed", 405, "The path exists, but not with this method."),
     ErrorCode("contract_mismatch", 409, "The template belongs to another contract."),
     ErrorCode(
@@ -103,7 +108,11 @@ _CODES = (
     ErrorCode("locked_out", 423, "Too many failed attempts for this subject."),
     ErrorCode("rate_limited", 429, "Too many requests with this API key or from this address."),
     ErrorCode("internal_error", 500, "A bug in the service: report the request id."),
-    ErrorCode("model_unavailable", 503, "The service runs without a model pack."),
+    ErrorCode(
+        "model_unavailable",
+        503,
+        "The service runs without a model pack, or the model failed on this request.",
+    ),
     ErrorCode("store_unavailable", 503, "The database does not respond."),
     ErrorCode("overloaded", 503, "Too many requests are waiting, or the worker is stopping."),
 )

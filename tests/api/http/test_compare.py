@@ -165,7 +165,6 @@ def test_real_people(
         decoy_faces=150, people=40, m=8, targets=(1e-2,),
     )  # fmt: skip
     contract.save(settings.resolved_contract_file, file_sealer(open_keyring(settings)))
-    settings = settings.model_copy(update={"accept_weak_privacy": True})
     decisions: dict[bool, list[str]] = {True: [], False: []}
     with Client(create_app(settings), headers=bearer(deployment.token)) as client:
         for mine, other in itertools.pairwise(folders[:13]):
