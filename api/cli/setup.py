@@ -92,7 +92,7 @@ def setup(
     """Prepare a service from a model pack and folders of photos, and judge it.
 
     With --faces alone nobody has to be labelled. Thresholds then assume that users look like those
-    faces, and how many genuine photos are rejected is not measured. So it is, too, where PEOPLE are
+    faces, and how many genuine photos are rejected is not measured. The same holds where PEOPLE are
     too few for any threshold.
 
     Makes the master key apart from the data, splits the people by the names of their folders so
