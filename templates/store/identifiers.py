@@ -8,8 +8,8 @@ from datetime import UTC, datetime
 from templates.errors import StoreError
 
 SUBJECT_ID_RULE = (
-    "1 to 128 characters in NFC: letters, marks and digits of any script, and . _ @ : -; it is not "
-    ". or .."
+    "1 to 128 characters: letters, marks and digits of any script, and . _ @ : - (stored in NFC); "
+    "not `.` and not `..`"
 )
 TENANT_NAME_RULE = "1 to 64 characters out of A-Z a-z 0-9 . _ -"
 OPAQUE_ID_RULE = "1 to 64 characters out of A-Z a-z 0-9 _ -"
@@ -17,6 +17,10 @@ OPAQUE_ID_RULE = "1 to 64 characters out of A-Z a-z 0-9 _ -"
 _SUBJECT_ID_LENGTH = 128
 _TENANT_NAME = re.compile(r"[A-Za-z0-9._-]{1,64}")
 _OPAQUE_ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
+# The letters and marks of Default_Ignorable_Code_Point (Unicode's DerivedCoreProperties.txt).
+_INVISIBLE = re.compile(
+    "[\u034f\u115f\u1160\u17b4\u17b5\u180b-\u180f\u3164\ufe00-\ufe0f\uffa0\U000e0000-\U000e0fff]"
+)
 
 Clock = Callable[[], datetime]
 
@@ -71,7 +75,10 @@ def _checked_subject_text(text: str, what: str) -> str:
 
 
 def _is_of_subject_id(character: str) -> bool:
-    return character in "._@:-" or unicodedata.category(character)[0] in "LMN"
+    if character in "._@:-":
+        return True
+    category = unicodedata.category(character)
+    return (category[0] in "LM" or category == "Nd") and not _INVISIBLE.match(character)
 
 
 def checked_tenant_name(text: str) -> str:
