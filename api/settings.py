@@ -35,6 +35,7 @@ DEFAULT_TENANT = "default"
 """Of the key that `veilface setup` makes, and of commands that name none."""
 OFF = "off"
 NONE = NO_PROXIES = "none"
+_OWN_PATHS = frozenset({"v1", "health", "metrics", "docs", "assets", "demo"})
 MAX_ONNX_THREADS = 256
 
 _ORIGIN = re.compile(
@@ -281,7 +282,8 @@ class Settings(BaseSettings):
         "",
         pattern=r"^(/[A-Za-z0-9._~-]+)*$",
         description="Path under which a proxy shows the service, such as `/faces` "
-        "(docs/deploy.md). The proxy may pass it on or take it away.",
+        "(docs/deploy.md). The proxy may pass it on or take it away. It does not begin with a path "
+        "of the service itself, such as `/v1`.",
     )
     web_page: bool = Field(
         True,
@@ -357,6 +359,16 @@ class Settings(BaseSettings):
                         "list IP addresses or networks, separated by commas, or write none or *"
                     ) from None
         return ",".join(names)
+
+    @field_validator("root_path")
+    @classmethod
+    def _no_path_of_ours(cls, value: str) -> str:
+        _, *steps = value.split("/")
+        if steps and steps[0] in _OWN_PATHS:
+            raise ValueError(f"must not begin with a path of the service itself: {steps[0]}")
+        if {".", ".."} & set(steps):
+            raise ValueError("must not have . or .. as a step, which clients take away")
+        return value
 
     @field_validator("cors_origins")
     @classmethod

@@ -9,6 +9,7 @@ from api.http.errors import StartError
 from api.settings import Settings, load_settings, settings_table
 from tests.api.deployment import environment_of
 
+OWN_PATHS = ("v1", "health", "docs", "assets", "metrics", "demo")
 DOCS = Path(__file__).resolve().parents[3] / "docs"
 
 
@@ -100,6 +101,9 @@ def test_a_slot_for_each_processor_that_the_process_may_use(
         ("lockout_after = 9\nlockout_disable_at = 8", "setting lockout_disable_at"),
         ("liveness = 'perhaps'", "setting liveness"),
         ("retention_days = 0", "setting retention_days"),
+        *((f"root_path = '/{own}/x'", "a path of the service itself") for own in OWN_PATHS),
+        ("root_path = '/a/../b'", "as a step"),
+        ("root_path = '/.'", "as a step"),
         ("master_key_variable = 'a-b'", "setting master_key_variable"),
         ("master_key_file = 'k'\nmaster_key_variable = 'K'", "give one of"),
     ],
