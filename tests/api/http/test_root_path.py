@@ -24,6 +24,7 @@ from veilface_client import Client as ServiceClient
 __all__ = ["chromium"]
 
 PREFIX = "/faces"
+METRICS = f"location ~ ^({PREFIX})+/metrics$"
 
 
 @pytest.fixture(scope="module")
@@ -64,11 +65,12 @@ def proxied(
     """The URL of the page behind nginx, by the block of ``docs/deploy.md``."""
     require_nginx()
     folder = tmp_path_factory.mktemp("nginx")
+    assert f"`{METRICS}`" in PAGE
     (block,) = re.findall(r"```nginx\n(limit_conn_zone .*?)```", PAGE, re.S)
     for written, changed in (
         ("location / {", f"location {PREFIX}/ {{"),
         ("http://127.0.0.1:8421", f"http://127.0.0.1:{deployment.settings.port}{request.param}"),
-        ("location = /metrics", f"location = {PREFIX}/metrics"),
+        ("location = /metrics", METRICS),
     ):
         assert block.count(written) == 1
         block = block.replace(written, changed)
@@ -90,7 +92,11 @@ def test_behind_a_real_proxy_everything_leads_somewhere(
         (server,) = http.get(urljoin(proxied, "v1/openapi.json")).json()["servers"]
         key = urljoin(proxied, server["url"] + "/v1/key")
         assert http.get(key, headers=bearer(deployment.token)).status_code == 200
-        assert http.get(urljoin(proxied, "metrics")).status_code == 404
+        for path in ("metrics", "%6detrics", "faces/metrics", "faces/faces/metrics"):
+            answer = http.get(urljoin(proxied, path))
+            # In HTML by nginx: the service's own answers are JSON.
+            assert (answer.status_code, answer.headers["content-type"]) == (404, "text/html"), path
+        assert http.get(urljoin(proxied, "v1/subjects/metrics")).status_code == 401
     with ServiceClient(proxied, deployment.token, verify=False) as client:
         client.enroll("anna", [photo(1), photo(1, 1)])
         assert client.verify("anna", photo(1, 2))
