@@ -58,6 +58,17 @@ async def refuse_unknown(request: Request) -> None:
     refuse_unknown_names(names, known, "query parameter")
     if len(set(names)) < len(names):
         raise ApiError("validation_failed", "a query parameter comes twice")
+    await refuse_body(request)
+
+
+async def refuse_body(request: Request) -> None:
+    """Refuse a body where the call takes none.
+
+    Raises
+    ------
+    ApiError
+        ``validation_failed``.
+    """
     headers = request.headers
     sent = headers.get("content-length", "0") != "0" or "transfer-encoding" in headers
     if sent and request.method in ("GET", "HEAD", "DELETE"):

@@ -15,7 +15,7 @@ from starlette.responses import Response
 from starlette.routing import BaseRoute, Route
 
 from api.http.answers import has_copy
-from api.http.deps import refuse_unknown
+from api.http.deps import refuse_body, refuse_unknown
 from api.http.errors import ApiError
 
 WEB = Path(__file__).resolve().parents[2] / "web"
@@ -50,6 +50,7 @@ WITH_GRAPHS = {
 }
 
 Endpoint = Callable[[Request], Awaitable[Response]]
+Check = Callable[[Request], Awaitable[None]]
 
 
 @dataclass(frozen=True)
@@ -101,7 +102,8 @@ def page_routes(*, demo: bool, serve_pack: bool) -> list[BaseRoute]:
             raise ApiError("not_found", "there is no such path")
         return file.answer(request, headers)
 
-    return [route_of("/", page), route_of("/assets/{name:path}", asset)]
+    # A person follows a link to the page, to which mail and search programs add parameters.
+    return [route_of("/", page, check=refuse_body), route_of("/assets/{name:path}", asset)]
 
 
 def _built_client(*, with_runtime: bool) -> dict[str, Served]:
@@ -114,13 +116,13 @@ def _built_client(*, with_runtime: bool) -> dict[str, Served]:
     }
 
 
-def route_of(path: str, endpoint: Endpoint) -> Route:
-    """Route a path that is not in the document of the API."""
+def route_of(path: str, endpoint: Endpoint, *, check: Check = refuse_unknown) -> Route:
+    """Route a path that is not in the document of the API, after a check of each request."""
 
     async def named(request: Request) -> Response:
         # What log lines and metrics call it, as FastAPI does for its own routes.
         request.scope["route"] = route
-        await refuse_unknown(request)
+        await check(request)
         return await endpoint(request)
 
     route = Route(path, named, methods=["GET"])

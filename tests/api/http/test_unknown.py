@@ -20,13 +20,21 @@ def operations(client: Client) -> Iterator[tuple[str, str]]:
 
 
 def test_no_call_takes_an_unknown_query_parameter(client: Client) -> None:
-    pages = [("GET", path) for path in ("/", "/assets/main.js", "/docs", "/v1/openapi.json")]
+    pages = [("GET", path) for path in ("/assets/main.js", "/docs", "/v1/openapi.json")]
     calls = [*operations(client), *pages]
     assert ("GET", "/health/live") in calls
     for method, path in calls:
         answer = client.request(method, path, params={"dry_run": "true"})
         details = assert_error(answer, 422, "validation_failed")
         assert "dry_run" not in details["known"]
+
+
+def test_the_page_is_shown_whatever_a_link_adds_to_its_address(client: Client) -> None:
+    page = client.get("/").text
+    for query in ("?utm_source=x", "?a=1&a=2", "?%ff&", "?x"):
+        answer = client.get(f"/{query}")
+        assert (answer.status_code, answer.text) == (200, page)
+    assert_error(client.request("GET", "/", content=b"x"), 422, "validation_failed")
 
 
 @pytest.mark.parametrize(
