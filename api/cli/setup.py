@@ -153,7 +153,9 @@ def setup(
 
         text += [] if serve else ["Start it: veilface serve"]
         text += _calls(service_url(settings), key_file)
-    text += plain_lines(contract.verdict, strangers=labelled is None)
+    # On whom a contract was judged that is kept, this call's arguments do not say.
+    strangers = labelled is None and steps["contract"] == "made"
+    text += plain_lines(contract.verdict, strangers=strangers)
     present(Result(facts, text, error=error), json=as_json)
     if serve:
         # Anew: this process has run the models, and what accelerators have begun outlives no fork.

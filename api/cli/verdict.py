@@ -75,7 +75,8 @@ def _groups_line(groups: Judgement | None) -> str:
 
 LIKE_PHOTOS, LIKE_OPENED = 600, (136, 3_600)
 """Photos of people like those enrolled, and templates that were opened and attacked where decoys
-had been adapted to so many or more: docs/results/privacy.md, 26 November 2026."""
+had been adapted to so many or more: LFW's people, and people drawn after them, November 2026
+(docs/results/privacy.md)."""
 
 
 STRANGERS_OPENED = "1 person in 7 to 1 in 12"
@@ -98,42 +99,36 @@ def plain_lines(verdict: Verdict | None, *, strangers: bool = False) -> tuple[st
             "Privacy: not proven: nobody measured it. `veilface calibrate` does.",
             "Accuracy: not measured.",
         )
-    privacy = _plain_privacy(verdict.privacy)
-    if strangers:
-        privacy += (
-            " This is measured on people of --faces; of LFW's people, behind decoys of FairFace's "
-            f"faces, it was {STRANGERS_OPENED} (docs/privacy.md, November 2026). PEOPLE like yours "
-            "tell you more."
-        )
-    return privacy, _plain_accuracy(verdict.accuracy)
+    return _plain_privacy(verdict.privacy, strangers), _plain_accuracy(verdict.accuracy)
 
 
-def _plain_privacy(privacy: Judgement) -> str:
+def _plain_privacy(privacy: Judgement, strangers: bool) -> str:
     opened, proven = privacy.rate, privacy.status == "PASS"
     said = "proven, against every attack that we know" if proven else "not proven"
-    if privacy.shortfall is not None:
-        text = f"{said}: {privacy.shortfall}."
-    elif not opened.errors:
-        text = (
-            f"{said}. If the database and the master key are both stolen, none of the "
-            f"{opened.trials} people attacked could be recognised elsewhere."
+    if opened.errors:
+        share = (
+            f"about {_one_in(opened, 'person', 'people')} could be recognised elsewhere "
+            f"({opened.errors} of {opened.trials})"
         )
     else:
-        text = (
-            f"{said}. If the database and the master key are both stolen, about "
-            f"{_one_in(opened, 'person', 'people')} could be recognised elsewhere "
-            f"({opened.errors} of {opened.trials})."
-        )
-    if proven:
-        return f"Privacy: {text}"
-    errors, trials = LIKE_OPENED
-    if privacy.shortfall is not None or opened.value > errors / trials:
+        share = f"none of the {opened.trials} people attacked could be recognised elsewhere"
+    text = f"Privacy: {said}. If the database and the master key are both stolen, {share}."
+    if privacy.shortfall is not None:
+        text += f" This is not enough to prove it: {privacy.shortfall}."
+    if strangers:
         text += (
-            f" With {LIKE_PHOTOS} photos or more of people like yours (PEOPLE, --like) it was "
-            f"about 1 in {trials / errors:.0f} where that was measured: on LFW, 26 November 2026 "
-            "(docs/results/privacy.md)."
+            " The share is measured on people of --faces; of LFW's people, behind decoys of "
+            f"FairFace's faces, it was {STRANGERS_OPENED} (docs/privacy.md, November 2026). PEOPLE "
+            "like yours tell you more."
         )
-    return f"Privacy: {text}"
+    errors, trials = LIKE_OPENED
+    if not proven and (privacy.shortfall is not None or opened.value > errors / trials):
+        text += (
+            f" With {LIKE_PHOTOS} photos or more of people like yours (PEOPLE, --like) the share "
+            f"was about 1 in {trials / errors:.0f} where that was measured: on LFW, on real and "
+            "drawn people, in November 2026 (docs/results/privacy.md)."
+        )
+    return text
 
 
 def _plain_accuracy(accuracy: Judgement | None) -> str:
@@ -148,7 +143,8 @@ def _plain_accuracy(accuracy: Judgement | None) -> str:
     )
     rejected = accuracy.rate
     if rejected.errors:
-        share = f"{_one_in(rejected, 'genuine attempt', 'genuine attempts')} is rejected"
+        verb = "are" if rejected.value >= _MANY else "is"
+        share = f"{_one_in(rejected, 'genuine attempt', 'genuine attempts')} {verb} rejected"
         share += f" ({rejected.errors} of {rejected.trials})"
     else:
         share = f"none of {rejected.trials:,} genuine attempts is rejected"
@@ -159,10 +155,14 @@ def _plain_accuracy(accuracy: Judgement | None) -> str:
 _IN_WORDS = {"1": "one", "2": "two", "3": "three", "None": "all"}
 
 
+_MANY = 0.25
+"""From this rate on, tenths are counted: 40 % as 1 in 2 would be wrong by a quarter."""
+
+
 def _one_in(rate: Rate, one: str, several: str) -> str:
     """Write a rate that is not zero as ``1 person in 14``, or as ``9 in 10 people`` if large."""
-    if rate.value > 0.4:
-        return f"{max(1, round(10 * rate.value))} in 10 {several}"
+    if rate.value >= _MANY:
+        return f"{int(10 * rate.value + 0.5)} in 10 {several}"
     return f"1 {one} in {1 / rate.value:,.0f}"
 
 

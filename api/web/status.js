@@ -62,7 +62,9 @@ function privacyCard({ verdict }) {
     ? `none of ${privacy?.rate.trials.toLocaleString("en")} people could be recognised elsewhere`
     : privacy.value > 0.7
       ? "nearly everybody could be recognised elsewhere"
-      : `about 1 person in ${Math.round(1 / privacy.value)} could be recognised elsewhere`;
+      : privacy.value >= 0.25
+        ? `about ${Math.round(10 * privacy.value)} in 10 people could be recognised elsewhere`
+        : `about 1 person in ${Math.round(1 / privacy.value)} could be recognised elsewhere`;
   return h(
     "section",
     { class: `card privacy ${proven ? "proven" : "unproven"}` },

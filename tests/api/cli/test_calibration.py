@@ -59,7 +59,7 @@ PHOTOS = {"enrolled_photos": 3, "probe_photos": 2}
             [
                 "Privacy: not proven. If the database and the master key are both stolen, about "
                 "1 person in 14 could be recognised elsewhere (43 of 600).",
-                "it was about 1 in 26 where that was measured: on LFW",
+                "the share was about 1 in 26 where that was measured: on LFW, on real and drawn",
                 "Accuracy: 1 genuine attempt in 50 is rejected (10 of 500), with three photos "
                 "enrolled and two shown.",
             ],
@@ -76,7 +76,24 @@ PHOTOS = {"enrolled_photos": 3, "probe_photos": 2}
         (
             judged(2, 15, shortfall="15 people are too few"),
             None,
-            ["Privacy: not proven: 15 people are too few. With", "Accuracy: not measured: nobody"],
+            [
+                "about 1 person in 8 could be recognised elsewhere (2 of 15). This is not enough "
+                "to prove it: 15 people are too few. With",
+                "Accuracy: not measured: nobody",
+            ],
+        ),
+        (
+            judged(100, 400),
+            judged(45, 90, **PHOTOS),
+            [
+                "about 3 in 10 people could be recognised elsewhere (100 of 400)",
+                "Accuracy: 5 in 10 genuine attempts are rejected (45 of 90)",
+            ],
+        ),
+        (
+            judged(160, 400),
+            judged(22, 90, **PHOTOS),
+            ["about 4 in 10 people", "Accuracy: 1 genuine attempt in 4 is rejected (22 of 90)"],
         ),
         (judged(0, 300), None, ["Privacy: proven", "none of the 300 people attacked could be"]),
     ],
@@ -88,7 +105,12 @@ def test_the_verdict_in_words_for_everybody(
     assert all(part in lines for part in said), lines
     assert ("was measured" in lines) == (privacy.status != "PASS")
     assert "LFW's people" not in lines
-    assert "1 person in 7 to 1 in 12" in plain_lines(Verdict(privacy), strangers=True)[0]
+    line = plain_lines(Verdict(privacy), strangers=True)[0]
+    assert "1 person in 7 to 1 in 12" in line
+    assert (
+        line.partition(" The share is measured on people of --faces")[0]
+        == (lines.partition("\n")[0].partition(" With 600 photos")[0])
+    )
 
 
 def test_what_more_photos_bring_stands_in_the_measurements() -> None:

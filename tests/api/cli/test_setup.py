@@ -181,7 +181,7 @@ def test_what_is_there_is_kept_and_the_rest_is_made(
     assert "These are promises of a contract made anew." in again.stdout
     assert token.read_text() not in again.stdout + again.stderr
     start, page, enroll, verify, privacy, accuracy = again.stdout.splitlines()[-6:]
-    assert privacy.startswith("Privacy: not proven: ")
+    assert privacy.startswith("Privacy: not proven. ")
     assert accuracy.startswith("Accuracy: ")
     assert start == "Start it: veilface serve"
     assert page.endswith(f"open http://127.0.0.1:8421/ and sign in with the key in {token}")
@@ -191,6 +191,10 @@ def test_what_is_there_is_kept_and_the_rest_is_made(
     ):
         assert f"curl -X {rest} -H " in call
         assert f"$(cat {token})" in call
+    faces = ("--faces", world.decoy_faces, "--faces", world.labelled)
+    unlabelled = run("setup", *faces, "--pack", world.pack, "--data-dir", data)
+    # The contract was made on labelled people, whatever this call has.
+    assert unlabelled.stdout.splitlines()[-2:] == [privacy, accuracy]
     checked = run("serve", "--check")
     assert checked.status == 0, checked.stderr
     keys = run("keys", "list", "--json").json
