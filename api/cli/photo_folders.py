@@ -1,12 +1,14 @@
 """Folders of photos that bulk commands are given; what is not read of them is named."""
 
 import csv
+import unicodedata
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from api.cli.console import message
 from api.cli.errors import CommandError, UsageError
+from templates.store.identifiers import InvalidIdentifier, checked_subject_id
 from verify import LabelledFolder, labelled_folder
 from verify.datasets import SUFFIXES, distinct_files, is_photo, photos_alone, visible
 
@@ -59,7 +61,23 @@ def labelled_people(folder: Path) -> LabelledFolder:
     return replace(labelled, paths=paths, identities=identities)
 
 
-def albums_of(source: Path) -> Mapping[str, Sequence[Path]]:
+@dataclass(frozen=True)
+class Albums:
+    """Photos of people.
+
+    Parameters
+    ----------
+    photos
+        By subject id. Names that are spellings of one id are one person.
+    left_out
+        Why nobody can be enrolled, by a name that breaks the rule or has no photo.
+    """
+
+    photos: Mapping[str, Sequence[Path]]
+    left_out: Mapping[str, str]
+
+
+def albums_of(source: Path) -> Albums:
     """Photos by person, of ``source/Person/photo.jpg`` or of a CSV file with a photo on each line.
 
     The file has the columns ``subject`` and ``photo``, a path relative to the file.
@@ -72,11 +90,26 @@ def albums_of(source: Path) -> Mapping[str, Sequence[Path]]:
         As of `verify.labelled_folder`.
     """
     albums: dict[str, list[Path]] = {}
+    left_out: dict[str, str] = {}
+    folders = [entry.name for entry in visible(source) if entry.is_dir()] if source.is_dir() else []
+    for name, photo in _named_photos(source):
+        try:
+            albums.setdefault(checked_subject_id(name), []).append(photo)
+        except InvalidIdentifier as error:
+            left_out[name] = str(error)
+    for name in folders:
+        if unicodedata.normalize("NFC", name) not in albums:
+            left_out.setdefault(name, f"no photo that is read: photos end in {_ENDINGS}")
+    return Albums(albums, left_out)
+
+
+def _named_photos(source: Path) -> Iterator[tuple[str, Path]]:
+    """Yield each photo with the name that stands beside it."""
     if source.is_dir():
         labelled = labelled_people(source)
-        for path, name in zip(labelled.paths, labelled.identities, strict=True):
-            albums.setdefault(name, []).append(path)
-        return albums
+        yield from zip(labelled.identities, labelled.paths, strict=True)
+        return
+    empty = True
     try:
         with source.open(encoding="utf-8-sig", newline="") as file:
             rows = csv.DictReader(file)
@@ -86,14 +119,14 @@ def albums_of(source: Path) -> Mapping[str, Sequence[Path]]:
                 subject, photo = (row[name] for name in COLUMNS)
                 if not subject or not photo:
                     raise UsageError(f"{source}, line {rows.line_num}: a subject and a photo")
-                albums.setdefault(subject, []).append(source.parent / photo)
+                empty = False
+                yield subject, source.parent / photo
     except FileNotFoundError:
         raise UsageError(f"{source} is neither a folder nor a CSV file") from None
     except (UnicodeDecodeError, csv.Error) as error:
         raise UsageError(f"{source} cannot be read as CSV: {error}") from None
-    if not albums:
+    if empty:
         raise UsageError(f"{source} names nobody")
-    return albums
 
 
 def people_or_faces(folder: Path) -> LabelledFolder:

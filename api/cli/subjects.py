@@ -1,6 +1,6 @@
 """``veilface enroll`` and ``veilface verify``: on this machine, against the store itself."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +12,7 @@ from api.cli.console import counted, demo_notice, message, progress
 from api.cli.errors import CommandError, UsageError, sentence
 from api.cli.files import read_photo
 from api.cli.options import LOCAL, Tenant
-from api.cli.photo_folders import albums_of
+from api.cli.photo_folders import Albums, albums_of
 from api.cli.results import Result, Table, reports
 from api.http.audit import operator
 from api.http.errors import ApiError
@@ -21,10 +21,11 @@ from api.service.runtime import Runtime
 from api.settings import DEFAULT_TENANT, Settings
 from enroll import Enrollment
 from enroll.enroller import MAX_PHOTOS, Holder
-from models.errors import PhotoRejected
+from models.errors import ModelError, PhotoRejected
 from models.pack import ModelPack
 from models.selection import FacePolicy
 from templates.decoys import Attributes
+from templates.errors import StoreBusy, StoreUnavailable, VeilfaceError
 from templates.keys.holder_key import (
     new_holder_key,
     read_holder_key,
@@ -32,9 +33,9 @@ from templates.keys.holder_key import (
 )
 from templates.space.agreement import InconsistentImages
 from templates.store.audit_log import Entry
-from templates.store.identifiers import InvalidIdentifier, checked_subject_id
+from templates.store.identifiers import checked_subject_id
 from templates.store.subject_rows import Source
-from templates.store.subjects import EnrollmentConflict, Precondition
+from templates.store.subjects import Precondition
 from verify import MAX_PROBE_PHOTOS, probe_of_photos
 
 Subject = Annotated[str, typer.Argument(help="Id of the person.")]
@@ -167,32 +168,42 @@ _SEVERAL_FACES = "A photo that shows several faces is taken with --face dominant
 
 def _enrolled_all(
     entrance: _Entrance,
-    albums: Mapping[str, Sequence[Path]],
+    albums: Albums,
     attributes: Attributes,
     face: FacePolicy,
     precondition: Precondition | None,
 ) -> Result:
-    """Enroll everybody who can be, and say who could not and why."""
+    """Enroll everybody who can be, and say who could not and why.
+
+    Where the database fails, nobody else is tried, and all who remain have its reason.
+    """
     enrolled: list[dict[str, Any]] = []
-    failed: list[dict[str, str]] = []
-    with progress("enrolling people", len(albums)) as advance:
-        for subject, album in albums.items():
-            photos = album[:MAX_PHOTOS]
+    failed = [{"subject_id": name, "message": why} for name, why in albums.left_out.items()]
+    outage: str | None = None
+    with progress("enrolling people", len(albums.photos)) as advance:
+        for subject, album in albums.photos.items():
+            photos, why = album[:MAX_PHOTOS], outage
             try:
-                prepared = _prepared(entrance, photos, attributes, face, None)
-                enrolled.append(_stored(entrance, subject, prepared, len(photos), precondition))
-            except (CommandError, EnrollmentConflict, InvalidIdentifier, OSError) as error:
-                failed.append({"subject_id": subject, "message": sentence(error)})
+                if outage is None:
+                    prepared = _prepared(entrance, photos, attributes, face, None)
+                    enrolled.append(_stored(entrance, subject, prepared, len(photos), precondition))
+            except (VeilfaceError, ModelError, OSError) as error:
+                why = sentence(error)
+                if isinstance(error, StoreUnavailable) and not isinstance(error, StoreBusy):
+                    outage = why
+            if why is not None:
+                failed.append({"subject_id": subject, "message": why})
             advance(1)
     _note_privacy(entrance.runtime)
     info = entrance.pack.info
     notice = demo_notice(info.embedder_sha256, n=info.n)
-    why = [(one["subject_id"], one["message"]) for one in failed]
+    reasons = [(one["subject_id"], one["message"]) for one in failed]
     report: list[str | Table] = []
     if failed:
-        report = [Table("Not enrolled", ("person", "why"), why), _SEVERAL_FACES]
+        report = [Table("Not enrolled", ("person", "why"), reasons), _SEVERAL_FACES]
     used = sum(one["photos"] for one in enrolled)
-    text = f"Enrolled {len(enrolled):,} of {len(albums):,} people, from {counted(used, 'photo')}."
+    people = len(enrolled) + len(failed)
+    text = f"Enrolled {len(enrolled):,} of {people:,} people, from {counted(used, 'photo')}."
     return Result(
         {"tenant": entrance.tenant, "enrolled": enrolled, "failed": failed, **notice},
         [*report, text],

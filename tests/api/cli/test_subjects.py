@@ -5,7 +5,10 @@ import sys
 
 import pytest
 
+from api.service.runtime import Runtime
 from models.demo import DEMO_NOTICE
+from models.errors import ProviderUnavailable
+from templates.errors import DecoyError, StoreBusy, StoreUnavailable
 from tests.api.cli.conftest import run
 from tests.patience import PATIENCE_S
 
@@ -84,6 +87,74 @@ def test_many_are_enrolled_and_who_is_not_is_named(world, veilface, tmp_path, li
     assert again.status == 1
     assert "Enrolled 0 of " in again.stdout
     assert "the subject is enrolled" in again.stdout
+
+
+@pytest.mark.parametrize("listed", [False, True])
+def test_spellings_of_an_id_are_one_person_and_a_wrong_id_is_named(
+    world, veilface, tmp_path, listed
+):
+    people = tmp_path / "people"
+    ids = {
+        "Zo\N{LATIN SMALL LETTER E WITH DIAERESIS}": 0,
+        "Zoe\N{COMBINING DIAERESIS}": 1,
+        "a b": 2,
+    }
+    for name, photo in ids.items():
+        (people / name).mkdir(parents=True)
+        shutil.copy(world.people / "person-1" / f"{photo}.png", people / name)
+    source = people
+    if listed:
+        source = tmp_path / "people.csv"
+        lines = [f"{name},people/{name}/{photo}.png" for name, photo in ids.items()]
+        source.write_text("\n".join(["subject,photo", *lines, ""]), encoding="utf-8")
+    ran = veilface("enroll", "--from", source, "--pack", world.pack, "--json")
+    assert ran.status == 1, ran.stderr
+    assert [(one["subject_id"], one["photos"]) for one in ran.json["enrolled"]] == [("Zo\xeb", 2)]
+    (failed,) = ran.json["failed"]
+    assert failed["subject_id"] == "a b"
+    assert "a subject id has 1 to 128 characters" in failed["message"]
+
+
+def test_a_person_without_a_photo_that_is_read_is_named(world, veilface, tmp_path):
+    people = tmp_path / "people"
+    shutil.copytree(world.people / "person-1", people / "person-1")
+    for name in ("empty", "gif", ".hidden"):
+        (people / name).mkdir()
+    (people / "gif" / "1.gif").write_bytes(b"GIF89a")
+    ran = veilface("enroll", "--from", people, "--pack", world.pack)
+    assert ran.status == 1
+    assert "Enrolled 1 of 3 people, from 5 photos." in ran.stdout
+    named = veilface("enroll", "--from", people, "--pack", world.pack, "--json").json["failed"]
+    assert [one["subject_id"] for one in named] == ["empty", "gif"]
+    assert all(one["message"].startswith("no photo that is read") for one in named)
+
+
+@pytest.mark.parametrize(
+    ("error", "failed"),
+    [
+        (StoreBusy("another write takes too long"), 1),
+        (DecoyError("there is no decoy of this class"), 1),
+        (ProviderUnavailable("cuda is not there"), 1),
+        (StoreUnavailable("the database cannot be reached"), 3),
+    ],
+)
+def test_what_happens_to_one_person_leaves_the_report(world, veilface, monkeypatch, error, failed):
+    """An outage of the database ends the run: the rest is named with its reason."""
+    put = Runtime.put
+
+    def fails_once(runtime, tenant, subject, *args, **kwargs):
+        if subject == "person-2":
+            raise error
+        return put(runtime, tenant, subject, *args, **kwargs)
+
+    monkeypatch.setattr(Runtime, "put", fails_once)
+    ran = veilface("enroll", "--from", world.people, "--pack", world.pack, "--json")
+    assert ran.status == 1, ran.stderr
+    assert [one["subject_id"] for one in ran.json["failed"]] == [
+        f"person-{number}" for number in range(2, 2 + failed)
+    ]
+    assert {one["message"] for one in ran.json["failed"]} == {str(error)}
+    assert len(ran.json["enrolled"]) == 4 - failed
 
 
 def test_many_are_enrolled_and_all_is_well(world, veilface):
