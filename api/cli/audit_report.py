@@ -65,7 +65,7 @@ def takes_limits(*names: str) -> Callable[[Callable[..., R]], Callable[..., R]]:
                     typer.Option(
                         min=0.0,
                         max=1.0,
-                        help=f"Most that passes: {limit.meaning}.",
+                        help=f"Limit: {limit.meaning}.",
                         rich_help_panel="Limits",
                     ),
                 ],

@@ -66,7 +66,7 @@ def templates(
     limits: Mapping[str, float],
     decoys: Annotated[
         Path | None,
-        typer.Option(help="The service's decoys. Unset: `decoys.veil` in `data_dir`."),
+        typer.Option(help="The file of `decoys build`. Unset: `decoys.veil` in `data_dir`."),
     ] = None,
     fit_decoys: Annotated[
         bool,

@@ -64,10 +64,9 @@ def distances(
     """Time all distances between probes and templates, beside the bare matrix product.
 
     Needs the extra `evaluate`. It draws embeddings of nobody, spread like faces, and lifts them.
-    Every time is shown as a multiple of the products that a distance starts from, made as one
-    matrix (`× product`), timed in turn in the same run; `authors` is the paper's Euclidean formula
-    as its authors compute it, in multiples of our time. The default options take some minutes; the
-    first run on a machine compiles the loops, which takes half a minute.
+    `× product` is a time as a multiple of the matrix product that a distance starts from, in the
+    same run; `authors` is the paper's Euclidean formula as its authors compute it, in multiples of
+    our time. The default options take some minutes, half a minute more at the first run.
 
     Example: `veilface bench distances --n 512 --dim 16 --metric spherical`
     """

@@ -83,8 +83,8 @@ def calibrate(
     probe_dims: Annotated[
         str | None,
         typer.Option(
-            help="Dimensions of lifted probes that clients may send, for example `2,4,8`; `none` "
-            "for none, which is quicker. Raw probes, such as photos, are always calibrated. Unset: "
+            help="Dimensions of lifted probes that clients may send, for example `2,4,8`, or "
+            "`none`, which is quicker; photos and embeddings are always calibrated. Unset: "
             f"{DEFAULT_PROBE_DIM}, or --dim where that is smaller."
         ),
     ] = None,
@@ -152,9 +152,9 @@ def calibrate(
     """Calibrate on labelled people, and write the contract file.
 
     Needs: a model pack, a decoys file, and photos of people with two photos or more each. 80
-    people resolve FMR 1e-2 and 1e-3; lower targets need more people, and those that the data
-    cannot resolve are refused. Of faces that nobody labelled, thresholds and privacy are measured
-    and rejections are not. The contract file belongs to the master key that is in force.
+    people resolve FMR 1e-2 and 1e-3; a level that the data cannot resolve is left out. Of faces
+    that nobody labelled, rejections are not measured. The contract file belongs to the master key
+    that is in force. docs/thresholds.md explains it.
 
     Example: `veilface calibrate lfw --pack buffalo_l --decoys decoys.veil --out contract.json
     --strategy adversarial`

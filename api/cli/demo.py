@@ -41,9 +41,8 @@ def demo(
     """Enroll, verify and erase people through the real service, in under a minute.
 
     Needs nothing: no weights, no database, no network. It draws faces, makes decoys and a
-    contract, starts the REST service on a free local port, uses it over HTTP, checks what it
-    answers, and leaves a folder that `veilface serve` can use. Exit status 1 means that something
-    was not as promised.
+    contract, starts the REST service on a free local port, checks what it answers over HTTP, and
+    leaves a folder that `veilface serve` can use. Exit status 1: something was not as promised.
 
     Example: `veilface demo`, or with real weights and faces
     `veilface demo --pack buffalo_l --faces lfw`

@@ -56,8 +56,8 @@ def evaluate(
     embeddings: Annotated[
         Path | None,
         typer.Option(
-            help="With `--pack none`: embeddings computed elsewhere, a `.npz` file with the "
-            "arrays `paths` and `descriptors`."
+            help="With `--pack none`: embeddings computed elsewhere, a `.npz` with `paths` and "
+            "`descriptors`."
         ),
     ] = None,
     decoys: Annotated[
@@ -78,8 +78,8 @@ def evaluate(
         int | None,
         typer.Option(
             min=2,
-            help="Leading axes of faces that embeddings are projected on where decoys are of a "
-            "generator. Unset: all, as in the paper.",
+            help="Axes that embeddings are projected on for generated decoys. Unset: all, as in "
+            "the paper.",
             show_default=False,
         ),
     ] = None,
@@ -126,8 +126,8 @@ def evaluate(
         str | None,
         typer.Option(
             metavar="ADDRESS",
-            help="Compare on a Dask cluster, whose scheduler is at this address, such as "
-            "`tcp://HOST:PORT`, and whose workers have veilface. Unset: here.",
+            help="Scheduler of a Dask cluster to compare on, such as `tcp://HOST:PORT`. Unset: "
+            "here.",
         ),
     ] = None,
     jobs: Annotated[
@@ -141,8 +141,7 @@ def evaluate(
     """Evaluate face verification with private templates: the LFW / CFP / AgeDB protocol.
 
     Writes results.json, results.csv, results.md, figures (PNG and SVG) and results.html, which has
-    all to read in one file, to --out. With --cache a second run does not embed the photos again.
-    docs/evaluation.md explains every figure.
+    all in one file, to --out. docs/evaluation.md explains every figure.
 
     Example: `veilface evaluate lfw.bin --pack buffalo_l --decoys decoys.veil --out lfw-results`
     """

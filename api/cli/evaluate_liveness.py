@@ -71,10 +71,9 @@ def evaluate_liveness(
 ) -> Result:
     """Evaluate the pack's liveness graphs on live and attack photos (ISO/IEC 30107-3).
 
-    Reports APCER for each attack species, BPCER, photos without a face and, with a contract, its
-    decoys and subjects, IAPMR through the whole verification. Writes results.json, results.csv,
-    results.md, a DET figure and results.html to --out. docs/liveness.md says what such graphs
-    cannot see.
+    Reports APCER by species, BPCER, photos without a face and, with a contract, its decoys and
+    subjects, IAPMR. Writes results.json, results.csv, results.md, a DET figure and results.html to
+    --out. docs/liveness.md says what such graphs cannot see.
 
     Example: `veilface evaluate liveness photos --pack buffalo_l --contract contract.json
     --out liveness-results`

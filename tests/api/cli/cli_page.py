@@ -12,7 +12,7 @@ PAGE = Path(__file__).resolve().parents[3] / "docs" / "cli.md"
 MARK = "<!-- Below, all is generated: python -m tests.api.cli.cli_page -->\n"
 HEAD = "| argument, option | meaning |\n|---|---|\n"
 JSON = "| `--json` |"
-SEVERAL = 3
+SEVERAL = 2
 """An option that means the same in so many commands is explained once."""
 
 
@@ -35,7 +35,8 @@ def page() -> str:
     head = PAGE.read_text(encoding="utf-8").partition(MARK)[0]
     commands = all_commands()
     counts = Counter(row for command in commands.values() for row in rows(command))
-    shared = {row for row, count in counts.items() if count >= SEVERAL}
+    options = (each for each in counts.items() if each[0].startswith("| `--"))
+    shared = {row for row, count in options if count >= SEVERAL}
     table = "".join(sorted(shared))
     without = [f"`{' '.join(path)}`" for path, each in commands.items() if not takes_json(each)]
     table += f"\nAll commands take `--json`, except {', '.join(without)}.\n"
