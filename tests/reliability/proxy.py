@@ -49,7 +49,10 @@ def write_configuration(block: str, folder: Path, listen: str) -> Path:
 @contextmanager
 def nginx(folder: Path, address: str, hosts: list[str], port: int) -> Iterator[str]:
     """Run nginx at an address, before hosts that serve on a port; gives its URL."""
-    (block,) = re.findall(r"```nginx\n(upstream .*?)```", PAGE, re.S)
+    (upstream,) = re.findall(r"```nginx\n(upstream .*?)```", PAGE, re.S)
+    (block,) = re.findall(r"```nginx\n(limit_conn_zone .*?)```", PAGE, re.S)
+    assert block.count("http://127.0.0.1:8421;") == 1
+    block = upstream + block.replace("http://127.0.0.1:8421;", "http://veilface;")
     for number, host in enumerate(hosts):
         written = f"10.0.0.{11 + number}:8421"
         assert written in block
