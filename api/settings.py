@@ -92,8 +92,8 @@ class Settings(BaseSettings):
     )
     database_url: str | None = Field(
         None,
-        description="SQLAlchemy URL of the database: `sqlite:///FILE` or "
-        "`postgresql+psycopg://USER:PASSWORD@HOST/NAME`. Unset: `veilface.db` in `data_dir`.",
+        description="URL of the database: `sqlite:///FILE` or `postgresql://USER:PASSWORD@HOST/NAME`. "
+        "Unset: `veilface.db` in `data_dir`.",
     )
     master_key_file: Path | None = Field(
         None,
@@ -110,18 +110,17 @@ class Settings(BaseSettings):
     )
     contract_file: Path | None = Field(
         None,
-        description="The contract that `veilface calibrate` wrote. Unset: `contract.json` in "
-        "`data_dir`.",
+        description="The contract. Unset: `contract.json` in `data_dir`.",
     )
     require_private: bool = Field(
         False,
         description="Refuse to start with a contract whose privacy is not proven: its verdict is "
-        "not PASS. Otherwise the log and the page say so.",
+        "not PASS.",
     )
     decoys_file: Path | None = Field(
         None,
-        description="The decoy source that `veilface decoys build` wrote; needed to enroll "
-        "photos. Unset: `decoys.veil` in `data_dir`, if it is there.",
+        description="The decoy source; needed to enroll photos. Unset: `decoys.veil` in "
+        "`data_dir`, if it is there.",
     )
     pack: Path | None = Field(
         None,
@@ -150,7 +149,7 @@ class Settings(BaseSettings):
         le=100_000,
         description="Requests with a body that may send it or wait for a compute slot in one "
         "worker; further ones are answered `overloaded`. One API key gets half of the places "
-        "at most. With `max_request_bytes` it bounds the memory for bodies.",
+        "at most.",
     )
     workers: int = Field(1, ge=1, le=256, description="Server processes.")
     host: str = Field("127.0.0.1", description="Address to listen on.")
@@ -172,9 +171,9 @@ class Settings(BaseSettings):
     )
     trusted_proxies: str = Field(
         "127.0.0.1",
-        description="Addresses or networks of reverse proxies, separated by commas: from them, "
-        "and from nobody else, `X-Forwarded-For` and `X-Forwarded-Proto` are believed. `none`: "
-        "from nobody. `*`: from everybody, so that a client can choose its address.",
+        description="Addresses or networks of reverse proxies, separated by commas: only from them "
+        "`X-Forwarded-For` and `X-Forwarded-Proto` are believed. `none`: from nobody. `*`: from "
+        "everybody, so that a client can choose its address.",
     )
     cors_origins: str = Field(
         NONE,
@@ -203,9 +202,7 @@ class Settings(BaseSettings):
         None,
         pattern=f"^{LEVEL_NAME.pattern}$",
         description="Lowest security level that a verification may ask for, as the contract names "
-        "it: levels of a larger false match rate are answered `forbidden`. Where none is asked, "
-        "the contract's default decides, or this level if the default is below it. Unset: any. An "
-        "API key may have a stricter one of its own.",
+        "it (docs/rest.md). Unset: any. An API key may have a stricter one of its own.",
     )
     liveness: LivenessPolicy = Field(
         LivenessPolicy.OFF,
