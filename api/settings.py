@@ -92,8 +92,8 @@ class Settings(BaseSettings):
     )
     database_url: str | None = Field(
         None,
-        description="URL of the database: `sqlite:///FILE` or `postgresql://USER:PASSWORD@HOST/NAME`. "
-        "Unset: `veilface.db` in `data_dir`.",
+        description="URL of the database: `sqlite:///FILE` or "
+        "`postgresql://USER:PASSWORD@HOST/NAME`. Unset: `veilface.db` in `data_dir`.",
     )
     master_key_file: Path | None = Field(
         None,
