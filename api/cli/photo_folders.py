@@ -8,7 +8,6 @@ from pathlib import Path
 
 from api.cli.console import message
 from api.cli.errors import CommandError, UsageError
-from templates.store.identifiers import InvalidIdentifier, checked_subject_id
 from verify import LabelledFolder, labelled_folder
 from verify.datasets import SUFFIXES, distinct_files, is_photo, photos_alone, visible
 
@@ -89,6 +88,9 @@ def albums_of(source: Path) -> Albums:
     DatasetError
         As of `verify.labelled_folder`.
     """
+    # Imported here: most commands that read folders open no store, which takes seconds to load.
+    from templates.store.identifiers import InvalidIdentifier, checked_subject_id
+
     albums: dict[str, list[Path]] = {}
     left_out: dict[str, str] = {}
     folders = [entry.name for entry in visible(source) if entry.is_dir()] if source.is_dir() else []
