@@ -17,7 +17,7 @@ async function login(name, photos) {
   const body = new FormData();
   for (const photo of photos) body.append("images", photo);
   const headers = { Authorization: `Bearer ${VEILFACE_API_KEY}` };
-  const path = `${VEILFACE_URL}/v1/subjects/${name}/verify`;
+  const path = `${VEILFACE_URL}/v1/subjects/${encodeURIComponent(name)}/verify`;
   const signal = AbortSignal.timeout(30_000);
   const answer = await fetch(path, { method: "POST", body, headers, redirect: "error", signal });
   const { decision, error } = await answer.json();
@@ -28,13 +28,22 @@ async function login(name, photos) {
 }
 
 function locked({ details }, seconds) {
-  const until = new Date(Date.now() + 1000 * seconds).toLocaleTimeString("en-GB");
-  const end = details.disabled ? "until an administrator lifts it" : `until ${until}; an administrator can lift it`;
+  const end = details.disabled ? "until an administrator lifts it" : `for ${seconds} s; an administrator can lift it`;
   return `too many attempts: locked ${end}`;
 }
 
+// The name in an address, or null. The service reads ids in NFC; no name may change the path of a call.
+function nameIn(url) {
+  try {
+    const name = decodeURIComponent(url.slice(1)).normalize("NFC");
+    return /^(?!\.{1,2}$)[\p{L}\p{M}\p{N}._@:-]{1,128}$/u.test(name) ? name : null;
+  } catch {
+    return null;
+  }
+}
+
 createServer(async (request, response) => {
-  const [, name] = /^\/([\w.@:-]{1,128})$/.exec(request.url) ?? [];
+  const name = nameIn(request.url);
   const fits = name && Number(request.headers["content-length"]) <= 20_000_000;
   const photos = fits ? await photosOf(request).catch(() => []) : [];
   const [status, text] = photos.length

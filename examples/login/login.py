@@ -2,9 +2,10 @@
 
 import os
 import secrets
-from datetime import datetime, timedelta
+import unicodedata
 from email import message_from_bytes
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from urllib.parse import unquote
 
 from veilface_client import Client, Forbidden, LockedOut, ServiceError, Unauthorized, VeilfaceError
 
@@ -39,11 +40,10 @@ def login(name: str, photos: list[bytes]) -> tuple[int, str]:
 
 
 def lifted(error: LockedOut) -> str:
-    """Say until when, and who can end it."""
+    """Say for how long, and who can end it."""
     if error.details.get("disabled"):
         return "until an administrator lifts it"
-    until = datetime.now() + timedelta(seconds=error.retry_after or 0)
-    return f"until {until:%H:%M:%S}; an administrator can lift it"
+    return f"for {error.retry_after or 0:.0f} s; an administrator can lift it"
 
 
 class Login(BaseHTTPRequestHandler):
@@ -51,7 +51,8 @@ class Login(BaseHTTPRequestHandler):
 
     def do_POST(self) -> None:
         """Log in."""
-        size, name = int(self.headers.get("Content-Length", 0)), self.path[1:]
+        size = int(self.headers.get("Content-Length", 0))
+        name = unicodedata.normalize("NFC", unquote(self.path[1:]))  # as the service reads it
         body = self.rfile.read(size) if 0 < size <= 20_000_000 else b""
         if photos := photos_of(self.headers.get("Content-Type", ""), body):
             status, text = login(name, photos)

@@ -12,6 +12,7 @@ import json
 import os
 import secrets
 import time
+import unicodedata
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -24,10 +25,18 @@ from cryptography.hazmat.primitives.serialization import load_pem_private_key
 from fastapi import FastAPI, Request, Response
 from fastapi.responses import HTMLResponse, JSONResponse, RedirectResponse
 from starlette.datastructures import UploadFile
+from starlette.exceptions import HTTPException
 from starlette.formparsers import MultiPartParser
 from starlette.middleware.base import RequestResponseEndpoint
 
-from veilface_client import AsyncClient, Forbidden, ServiceError, Unauthorized, VeilfaceError
+from veilface_client import (
+    AsyncClient,
+    Forbidden,
+    LockedOut,
+    ServiceError,
+    Unauthorized,
+    VeilfaceError,
+)
 
 ISSUER = os.environ["ISSUER"]
 CLIENTS: dict[str, dict[str, str]] = json.loads(os.environ["CLIENTS"])
@@ -215,12 +224,16 @@ async def login(request: Request) -> Response:
     asked = None if claims is None else Asked(**claims)
     if asked is None or asked.number in used:
         return page("This login has expired. Start again in the application.", 400)
-    async with request.form(max_files=MOST_PHOTOS, max_fields=1) as form:
-        name = form.get("name")
-        files = [file for file in form.getlist("images") if isinstance(file, UploadFile)]
-        if not isinstance(name, str) or not files:
-            return page("Give a name and a photo.", 400, asked)
-        photos = [await file.read() for file in files]
+    try:
+        async with request.form(max_files=MOST_PHOTOS, max_fields=1) as form:
+            name = form.get("name")
+            files = [file for file in form.getlist("images") if isinstance(file, UploadFile)]
+            if not isinstance(name, str) or not files:
+                return page("Give a name and a photo.", 400, asked)
+            photos = [await file.read() for file in files]
+    except HTTPException:  # too many files, or no such form
+        return page("Give a name and a photo. At most five photos.", 400, asked)
+    name = unicodedata.normalize("NFC", name)  # as the service reads it: one person, one `sub`
     try:
         async with AsyncClient(
             os.environ["VEILFACE_URL"], os.environ["VEILFACE_API_KEY"]
@@ -228,7 +241,9 @@ async def login(request: Request) -> Response:
             accepted = bool(await veilface.verify(name, photos))
     except (Unauthorized, Forbidden):  # our key, not their face
         return page("Logging in by face does not work now.", 502, asked)
-    except ServiceError as error:  # no face in the photo, locked out …
+    except LockedOut as error:
+        return page(f"{error.message}. An administrator can lift the lock.", error.status, asked)
+    except ServiceError as error:  # no face in the photo …
         return page(error.message, error.status, asked)
     except ValueError:  # no name that anybody can have
         accepted = False

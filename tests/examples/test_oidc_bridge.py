@@ -203,6 +203,42 @@ def test_another_face_gets_no_code(bridge: httpx.Client, service: Service) -> No
         client.reset_lockout("ann")
 
 
+@pytest.mark.parametrize("typed", ["zo\u00eb", "zoe\u0308"])
+def test_a_person_is_one_subject_however_the_name_is_typed(
+    bridge: httpx.Client, service: Service, typed: str
+) -> None:
+    with Client(service.url, service.token) as client:
+        client.enroll("zo\u00eb", [service.photo(1, number) for number in range(3)])
+        try:
+            answer = show(bridge, begin(bridge), typed, service.photo(1, 4))
+        finally:
+            client.erase("zo\u00eb")
+    _, body, _ = change(bridge, returned(answer)["code"]).json()["id_token"].split(".")
+    assert json.loads(decoded(body))["sub"] == "zo\u00eb"
+
+
+def test_too_many_photos_are_told_on_the_page(bridge: httpx.Client) -> None:
+    files = [("images", (f"{number}.jpg", b"x")) for number in range(6)]
+    cookie = begin(bridge)
+    answer = bridge.post("/login", data={"name": "ann"}, files=files, headers={"Cookie": cookie})
+    assert answer.status_code == 400
+    assert "At most five photos." in answer.text
+    assert "<form" in answer.text
+
+
+def test_a_lock_tells_who_can_lift_it(bridge: httpx.Client, service: Service) -> None:
+    cookie = begin(bridge)
+    with Client(service.url, service.token) as client:
+        client.enroll("lou", [service.photo(1, number) for number in range(3)])
+        try:
+            while (answer := show(bridge, cookie, "lou", service.photo(2, 0))).status_code == 401:
+                pass
+        finally:
+            client.erase("lou")
+    assert answer.status_code == 423
+    assert "An administrator can lift the lock." in answer.text
+
+
 def test_a_body_that_is_too_large_is_not_read(bridge: httpx.Client) -> None:
     assert bridge.post("/login", content=bytes(20_000_001)).status_code == 413
     assert bridge.post("/token", content=iter([b"x"])).status_code == 413, "in chunks"
