@@ -50,6 +50,7 @@ export function holderKey(action, subject, onchange) {
     off: off ? ["passkey"] : [],
     describedby: offId,
     onchange: (value) => {
+      chosen = false;
       panel.replaceChildren(...panels[value]);
       onchange();
     },
@@ -57,6 +58,8 @@ export function holderKey(action, subject, onchange) {
   // Another attempt to enroll takes the same passkey.
   let made = null;
   let known = null;
+  // Whether the choice is the page's own, for the person who was named.
+  let chosen = false;
 
   function choose(value) {
     source.choose(value);
@@ -93,6 +96,8 @@ export function holderKey(action, subject, onchange) {
 
   async function learn() {
     lock.textContent = "";
+    if (chosen) choose("none");
+    chosen = false;
     const id = subject.value;
     if (!id || !may("enroll")) return;
     // A person who is not enrolled, or cannot be asked about now, is verified as the visitor chose.
@@ -100,7 +105,10 @@ export function holderKey(action, subject, onchange) {
     if (!person || subject.value !== id) return;
     lock.textContent = person.holder_key ? "This enrollment is locked to a holder key." : "";
     if (!person.holder_key) choose("none");
-    else if (source.value() === "none") choose(off ? "file" : "passkey");
+    else if (source.value() === "none") {
+      choose(off ? "file" : "passkey");
+      chosen = true;
+    }
   }
 
   if (action === "verify") {

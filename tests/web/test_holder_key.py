@@ -161,6 +161,23 @@ def test_a_passkey_of_another_id_is_not_sent(visit: Visit) -> None:
     assert visitor.sent("/verify") == 0
 
 
+def test_a_passkey_is_of_an_id_however_it_is_spelt(visit: Visit) -> None:
+    page = visit().tab.page
+    keys = page.evaluate(
+        """async () => {
+          const { createPasskey, passkeyHolderKey } = await import("/assets/client/client.js");
+          const { signal } = new AbortController();
+          const made = await createPasskey("fo\u0308und", signal);
+          const keys = [];
+          for (const id of ["fo\u0308und", "f\u00f6und"]) {
+            keys.push(String(await passkeyHolderKey(id, signal, made)));
+          }
+          return keys;
+        }"""
+    )
+    assert len(set(keys)) == 1
+
+
 def test_what_keeps_a_passkey_from_being_used_is_said(visit: Visit) -> None:
     visitor = visit()
     tab, page = visitor.tab, visitor.tab.page
@@ -212,6 +229,11 @@ def test_a_key_file_locks_where_an_ip_address_has_no_passkeys(
     tab.name_person(SUBJECT)
     tab.choose_drawn(PERSON, 4)
     expect(page.get_by_role("radio", name="Key file")).to_be_checked()
+    # What the page chose for one person is not chosen for the next.
+    for name, choice in (("nobody", "None"), (SUBJECT, "Key file")):
+        tab.name_person(name)
+        page.get_by_label("Person’s id").blur()
+        expect(page.get_by_role("radio", name=choice, exact=True)).to_be_checked()
     for chosen, decision in ((other, "reject"), (own, "accept")):
         file.set_input_files(chosen)
         tab.press("Verify")

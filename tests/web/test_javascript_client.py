@@ -175,7 +175,7 @@ def test_the_element(
     assert calls["PUT /v1/subjects/*/enrollment"]["members"] == ["template"]
     login.evaluate("(each) => each.removeAttribute('liveness')")
     login.evaluate("(each) => each.removeAttribute('action')")
-    for who, says in ((WHO, "Welcome."), (OTHER, "That did not match. Try again.")):
+    for who, says in ((WHO, "Welcome."), (OTHER, "Not recognised. Try again.")):
         camera.shows(people[who][0])
         tab.page.get_by_role("button", name="Start camera").click()
         tab.page.get_by_role("button", name="Log in").click()

@@ -493,7 +493,8 @@ export class VeilfaceLogin extends Base {
     const { code, details } = error as Error & { code?: unknown; details?: { liveness?: string } };
     if (details?.liveness !== undefined && !this.#sendsFrames) return this.words.liveness;
     const { errors } = this.words;
-    return typeof code === "string" && Object.hasOwn(errors, code) ? errors[code] : error.message;
+    if (typeof code === "string" && Object.hasOwn(errors, code)) return errors[code];
+    return code === "locked_out" ? `${error.message}. ${this.words.locked}` : error.message;
   }
 
   #tell(event: string, detail: unknown): void {

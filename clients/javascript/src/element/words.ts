@@ -25,6 +25,8 @@ export interface Words {
   /** By their names in a challenge, and `front` and `move_back`. */
   readonly movements: Readonly<Record<string, string>>;
   readonly notLive: string;
+  /** Follows the message where too many attempts have failed. */
+  readonly locked: string;
   /** The service asks for liveness, and the page for none. */
   readonly liveness: string;
   /** What to do before the camera, by what keeps the face from being good enough. */
@@ -45,7 +47,7 @@ export const WORDS: Words = {
   working: "One moment …",
   passkey: "Use your passkey.",
   accept: "Welcome.",
-  reject: "That did not match. Try again.",
+  reject: "Not recognised. Try again.",
   enrolled: "You are enrolled.",
   camera: "The camera cannot be used.",
   video: "Your camera",
@@ -61,6 +63,7 @@ export const WORDS: Words = {
     come_closer: "Come closer.",
   },
   notLive: "The movements were not seen. Follow each of them, in good light.",
+  locked: "An administrator can lift the lock.",
   liveness: "This service checks that a face is live, which takes photos. This page sends none.",
   hints: {
     no_face: "Bring your face into the outline.",

@@ -17,7 +17,7 @@ export interface Passkey {
 const random = (count: number): Uint8Array<ArrayBuffer> =>
   crypto.getRandomValues(new Uint8Array(count));
 const labelled = (subject: string): Uint8Array<ArrayBuffer> =>
-  new TextEncoder().encode(LABEL + subject);
+  new TextEncoder().encode(LABEL + subject.normalize("NFC"));
 const saltOf = async (subject: string): Promise<Uint8Array<ArrayBuffer>> =>
   new Uint8Array(await crypto.subtle.digest("SHA-256", labelled(subject)));
 
