@@ -132,8 +132,9 @@ export const folded = (summary, ...content) =>
   h("details", {}, h("summary", {}, summary), h("div", { class: "inside" }, content));
 
 // Ask in a modal dialog, with the focus on the answer that does nothing; resolves to whether the visitor agreed.
-// It closes unanswered when `signal` ends.
-export function confirmed(title, text, verb, signal) {
+// It closes unanswered when `signal` ends, and does not open after that.
+export async function confirmed(title, text, verb, signal) {
+  if (signal.aborted) return false;
   const id = newId("dialog");
   const answer = (value) => () => dialog.close(value);
   const dialog = h(

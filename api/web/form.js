@@ -17,12 +17,16 @@ export function photoForm(id, view) {
   const { action, replaces = false } = view;
   const why = whyOff(action);
   const on = why === null;
-  const subject = subjectField(id, action, () => rest());
+  const ended = new AbortController();
+  const subject = subjectField(id, action, () => rest(), ended.signal);
   const problem = h("div", {});
   const result = h("div", { class: "result", role: "status" });
   const progress = h("div", { class: "progress", role: "status" });
+  const empty = h("div", { class: "empty" });
   const send = h("button", { type: "submit", class: "primary", disabled: true });
-  const say = (text) => (send.textContent = text);
+  // A button's text is not read out when it changes.
+  const heard = h("p", { class: "unseen", role: "status" });
+  const say = (text) => (send.textContent = heard.textContent = text);
   const moving = () => on && (view.moving?.() ?? false);
   // Counts what was asked: an answer to what is no longer on the page is not shown.
   let asked = 0;
@@ -36,7 +40,7 @@ export function photoForm(id, view) {
     if (!shooting) clear();
   };
   let shooting = false;
-  const picker = on ? photoPicker({ most: view.most, replaces, shutter: !replaces, onchange: changed }) : null;
+  const picker = on ? photoPicker({ most: view.most, replaces, shutter: !replaces, onchange: changed, onsource: () => rest() }) : null;
   const mode = on ? session.mode?.offer(action, refresh) : null;
   const holder = holderKey(action, subject.input, clear);
   // The camera whose photos are sent as soon as they are taken.
@@ -54,14 +58,21 @@ export function photoForm(id, view) {
     rest();
   }
 
-  // What the button does next.
+  // What the button does next, and what becomes of the photos.
   function rest() {
+    empty.replaceChildren(view.empty());
+    // Until the attempt is over, the button tells how far it is.
+    if (on && fields.disabled) return;
     const camera = shutter();
     const starts = camera !== null && !camera.isOn();
-    say(starts ? "Start camera" : moving() ? "Start head movements" : view.verb);
+    send.textContent = starts ? "Start camera" : moving() ? "Start head movements" : view.verb;
+    heard.textContent = "";
     send.disabled = !(camera || moving() || picker?.ready());
     send.formNoValidate = starts;
-    if (picker && view.progress) progress.replaceChildren(...view.progress(picker.chosen().length, subject.person()));
+    if (!picker || !view.progress) return;
+    const words = h("div", {}, view.progress(picker.chosen().length, subject.person()));
+    // Only what changed is read out.
+    if (words.textContent !== progress.textContent) progress.replaceChildren(...words.childNodes);
   }
 
   async function submit(event) {
@@ -133,9 +144,9 @@ export function photoForm(id, view) {
       on ? folded(action === "verify" ? "Options" : "Options: lock to a passkey, largest face", holder.parts, picker.option) : null,
     ),
     h("div", { class: "card photo-part" }, picker?.root, on ? view.movements?.root : null, switchOf(mode)),
-    h("div", { class: "act-part" }, progress, send),
+    h("div", { class: "act-part" }, progress, send, heard),
   );
-  const outcome = h("div", { class: "outcome" }, problem, result, h("div", { class: "empty" }, view.empty()));
+  const outcome = h("div", { class: "outcome" }, problem, result, empty);
   const form = h("form", { class: "work", onsubmit: submit }, fields, outcome);
   const root = h(
     "section",
@@ -154,6 +165,7 @@ export function photoForm(id, view) {
     refresh,
     stop() {
       asked += 1;
+      ended.abort();
       view.stop?.();
       view.movements?.stop();
       holder.stop();

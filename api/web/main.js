@@ -70,8 +70,39 @@ function signedIn(focus) {
 
 function signOut(problem) {
   forgetKey();
+  // It may name a person.
+  history.replaceState(null, "", location.pathname + location.search);
   nav.hidden = who.hidden = true;
   show(signInView(problem), "Sign in");
+}
+
+// Go on with the key that this tab has kept.
+async function resume(focus) {
+  try {
+    await learn();
+    signedIn(focus);
+  } catch (error) {
+    if (error.status === 401) signOut(error);
+    else if (hasKey()) show(waitingView(error), "Not signed in", focus);
+  }
+}
+
+// The key is kept, and the service does not say whether it is good.
+function waitingView(problem) {
+  const retry = () => {
+    again.disabled = true;
+    resume(true);
+  };
+  const again = h("button", { type: "button", onclick: retry }, "Try again");
+  const root = h(
+    "section",
+    {},
+    h("h1", { tabindex: "-1" }, "Not signed in yet"),
+    h("p", { class: "lead" }, "This tab has kept your API key."),
+    problemBox(problem),
+    h("p", { class: "row" }, again, h("button", { type: "button", class: "secondary", onclick: () => signOut(null) }, "Sign out")),
+  );
+  return { root };
 }
 
 function signInView(problem = null) {
@@ -153,14 +184,5 @@ for (const type of ["dragover", "drop"]) {
   addEventListener(type, (event) => carriesFiles(event) && event.preventDefault());
 }
 
-if (hasKey()) {
-  try {
-    await learn();
-    signedIn(false);
-  } catch (error) {
-    if (error.status === 401) signOut(error);
-    else show(signInView(error), "Sign in", false);
-  }
-} else {
-  show(signInView(), "Sign in", false);
-}
+if (hasKey()) await resume(false);
+else show(signInView(), "Sign in", false);

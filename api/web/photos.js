@@ -31,8 +31,9 @@ async function smaller(blob) {
 }
 
 // `most` photos; with `replaces`, what is chosen takes the place of what was chosen before. With `shutter` the camera has
-// a button of its own; else `live()` is the camera, where that is the source.
-export function photoPicker({ most, replaces = false, shutter = false, onchange }) {
+// a button of its own; else `live()` is the camera, where that is the source. `onchange` is called where the chosen photos
+// change, `onsource` where the camera goes on or off or other photos are offered.
+export function photoPicker({ most, replaces = false, shutter = false, onchange, onsource }) {
   const photos = [];
   const tray = h("ul", { class: "tray", "aria-label": "Chosen photos" });
   const status = h("p", { class: "hint", role: "status" });
@@ -150,7 +151,7 @@ export function photoPicker({ most, replaces = false, shutter = false, onchange 
         face,
         onchange: () => {
           button.textContent = verb();
-          onchange();
+          onsource();
         },
       });
       async function press() {
@@ -216,7 +217,7 @@ export function photoPicker({ most, replaces = false, shutter = false, onchange 
     live?.stop();
     live = null;
     panel.replaceChildren(...sources[source]());
-    onchange();
+    onsource();
   }
 
   const names = { ...(DEMO ? { drawn: "Cartoon people" } : {}), camera: "Camera", files: "Files" };

@@ -76,7 +76,7 @@ export function offer(action, onchange) {
       onchange();
     },
   });
-  const offered = { action, why: null, root: null, at, say };
+  const offered = { action, why: "", root: null, at, say };
   let dropped = "";
 
   function at(level, picker) {
@@ -263,8 +263,7 @@ export const verify = (name, { photos, face, level, holder_key }) =>
 // `replaces` is the template that may be replaced, or null.
 export const enroll = (name, { photos, face, holder_key }, replaces) =>
   attempt({ subject_id: name, action: "enroll", photos, face }, async (client, lift) => {
-    const answer = await client.enroll(name, lift, { replace: replaces ?? false, ...holder(holder_key) });
-    return { ...answer, images: photos.map(() => ({ status: "lifted in this browser" })) };
+    return await client.enroll(name, lift, { replace: replaces ?? false, ...holder(holder_key) });
   });
 
 // Count every call of the page, in private mode or not.

@@ -115,6 +115,6 @@ export const levels = () =>
     .filter((each) => session.own.levels.includes(each.name));
 
 // Whether a verification must answer a challenge of head movements.
-export const moves = () => ["active", "both"].includes(session.own.liveness);
+export const moves = () => ["active", "both"].includes(session.own?.liveness);
 
 export const crops = () => !session.contract.recorded.detector;

@@ -1,4 +1,4 @@
-import { download, facts, field, folded, h, oneIn, percent, table, when } from "./dom.js";
+import { download, facts, field, folded, h, oneIn, percent, plural, table, when } from "./dom.js";
 import { call, may, session, subjectPath } from "./service.js";
 import { people } from "./subject.js";
 import { problemBox } from "./words.js";
@@ -68,7 +68,7 @@ function privacyCard({ verdict }) {
   return h(
     "section",
     { class: `card privacy ${proven ? "proven" : "unproven"}` },
-    h("h2", { class: "verdict-word" }, privacy ? (proven ? "✓ Privacy: shown" : "Privacy: not proven") : "Privacy: not measured"),
+    h("h2", { class: "verdict-word" }, privacy ? (proven ? "✓ Privacy: proven" : "Privacy: not proven") : "Privacy: not measured"),
     h(
       "p",
       {},
@@ -123,7 +123,7 @@ function storedCard({ binding, contract_id: id, recorded, default_level: level, 
         facts([
           ["Id", name],
           ["Template", ["encrypted, ", h("code", {}, `${person.template_id.slice(0, 12)}…`)]],
-          ["Made of", person.photos ? `${person.photos} photos, which are not kept` : "a template that a client lifted"],
+          ["Made of", person.photos ? `${plural(person.photos, "photo", "photos")}, not kept` : "a template that a client lifted"],
           ["Enrolled", when(person.updated_at)],
           ["Holder key", person.holder_key ? "needed, and not kept" : null],
         ]),

@@ -42,8 +42,8 @@ export const switchOf = (mode) =>
   offNote(LIFTS && !session.mode && "Private mode could not be loaded: photos are sent to the service. Reload the page.");
 
 // `input`, its `part` of the form, `id()` in the form in which the service keeps it, and `person()`, who is known to be
-// enrolled under it, or null; `onperson` is called where that changes.
-export function subjectField(id, action, onperson) {
+// enrolled under it, or null; `onperson` is called where that changes. Searches end with `until`.
+export function subjectField(id, action, onperson, until) {
   const searches = may("enroll");
   const list = h("datalist", { id: newId("people") });
   const status = h("p", { class: "hint", role: "status" });
@@ -95,9 +95,15 @@ export function subjectField(id, action, onperson) {
     running.abort();
     running = new AbortController();
     status.replaceChildren();
+    known = null;
+    onperson();
     timer = setTimeout(search, PAUSE_MS);
   });
   input.addEventListener("focus", () => input.value || list.childElementCount || search());
+  until.addEventListener("abort", () => {
+    clearTimeout(timer);
+    running.abort();
+  });
   part.append(list, status);
   if (id) search();
   return { input, part, id: typedId, person };

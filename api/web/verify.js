@@ -43,7 +43,7 @@ export function verifyView(id) {
   }
 
   function remedies({ code }, name, { problem, send: button }) {
-    if (code === "locked_out" && may("admin")) return [lifter(name, problem, button)];
+    if (code === "locked_out" && may("admin")) return lifter(name, problem, button);
     if (code === "not_enrolled" && may("enroll")) return [enroller(name)];
     return [];
   }
@@ -69,16 +69,17 @@ export function verifyView(id) {
 
 // For operators: the lock is lifted where it was met.
 function lifter(name, problem, button) {
+  const failure = h("div", {});
   const lift = async () => {
     try {
       await call("DELETE", `${subjectPath(name)}/lockout`);
       problem.replaceChildren(h("p", { class: "off", role: "status" }, `The lock on ${name} is lifted.`));
       button.focus();
     } catch (error) {
-      problem.prepend(problemBox(error));
+      failure.replaceChildren(problemBox(error));
     }
   };
-  return h("button", { type: "button", class: "secondary", onclick: lift }, "Lift the lock");
+  return [failure, h("button", { type: "button", class: "secondary", onclick: lift }, "Lift the lock")];
 }
 
 function decision(id, answer, kind) {

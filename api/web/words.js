@@ -6,7 +6,6 @@ export const DEMO = document.documentElement.dataset.demo === "yes";
 
 const REMEDIES = {
   unauthorized: "Check the API key: it may be mistyped, revoked or expired.",
-  forbidden: "Ask the operator for a key that has this right.",
   not_enrolled: "Check the id, or enroll the person first.",
   not_found: "The service has nothing at this address. It may have been updated: reload the page.",
   contract_mismatch: "This person was enrolled under an earlier contract. Enroll them again.",
@@ -25,7 +24,7 @@ const REMEDIES = {
   rate_limited: "Wait, then try again.",
   overloaded: "Try again in a moment.",
   store_unavailable: "Try again in a moment. If it keeps happening, tell the operator.",
-  model_unavailable: "This service cannot take photos. Ask the operator.",
+  model_unavailable: "Try again in a moment. If it keeps happening, tell the operator.",
   enrollment_conflict: "This person was enrolled or erased meanwhile. Look them up, and enroll them again if need be.",
   passkey_refused: "Try again, on the device that has the passkey. If it is lost, enroll the person again.",
   passkey_unsupported: "Use another device or browser, or a key file. If a passkey was made just now, delete it.",
@@ -38,6 +37,20 @@ const REMEDIES = {
   internal_error: "Report the request id to the operator.",
   unreachable: "Check your connection and that the service is running, then try again.",
 };
+
+// What to do where something is forbidden, by what the details name.
+const FORBIDDEN = {
+  missing: "Ask the operator for a key that has this right.",
+  lowest_level: "Choose a stricter level, or ask the operator for another key.",
+  tenant_setting: "Switch private mode off: photos then go to the service.",
+  liveness: "Reload the page: what this service asks for has changed.",
+};
+
+function remedy({ code, details }) {
+  if (code !== "forbidden") return REMEDIES[code] ?? "Reload the page and try again.";
+  const reason = Object.keys(FORBIDDEN).find((name) => name in details);
+  return FORBIDDEN[reason] ?? "Ask the operator whether this key may do it.";
+}
 
 // What a movement is called, and where its arrow points: in the picture, which is a mirror.
 export const FRONT = "front";
@@ -160,7 +173,7 @@ export function problemBox(problem) {
             {},
             disabled
               ? "This person is locked out until an operator lifts the lock."
-              : (REMEDIES[code] ?? "Reload the page and try again."),
+              : remedy(problem),
           ),
     problem.wait && !disabled ? waiting(problem.wait) : null,
     h(

@@ -7,6 +7,11 @@ from playwright.sync_api import Page, Route
 
 from tests.patience import PATIENCE_S
 
+DECISION = {
+    "decision": "accept", "reason": "match", "level": "fmr-1e-2", "fmr": 0, "contract_id": "0" * 64,
+    "calibration_id": "0" * 64, "request_id": "0" * 32,
+}  # fmt: skip
+
 
 class PendingRequests:
     """Requests that match a pattern, answered when the test says so."""

@@ -10,7 +10,7 @@ import pytest
 from playwright.sync_api import Error, Page, expect
 
 from tests.api.cli.conftest import run
-from tests.web.answers import PendingRequests, refused
+from tests.web.answers import DECISION, PendingRequests, refused
 from tests.web.conftest import OpenTab
 from tests.web.served import Served
 from tests.web.walk import TO_FILE, enroll
@@ -19,10 +19,6 @@ pytestmark = pytest.mark.long
 
 NAMES = ("found-ada", "found-ben", "found-ben-2")
 DECOMPOSED = "fo\u0308und"
-DECISION = {
-    "decision": "accept", "reason": "match", "level": "fmr-1e-2", "fmr": 0, "contract_id": "0" * 64,
-    "calibration_id": "0" * 64, "request_id": "0" * 32,
-}  # fmt: skip
 DROP = """
 async ([selector, url]) => {
   const data = new DataTransfer();
@@ -62,6 +58,10 @@ def test_people_whose_ids_begin_so_are_suggested(open_tab: OpenTab, demo: Served
     expect(suggested).to_have_count(3)
     expect(suggested.last).to_have_text(re.compile("^1 photo, "))
     expect(page.get_by_text("3 people found.")).to_be_visible()
+    tab.open("Service")
+    page.get_by_label("Person", exact=True).select_option(NAMES[0])
+    expect(page.get_by_text("1 photo, not kept")).to_be_visible()
+    tab.open("Verify")
     # One that is enrolled is enough said, though another id begins with it.
     field.fill("found-ben")
     expect(page.get_by_text("✓ Enrolled: 1 photo")).to_be_visible()
@@ -145,6 +145,98 @@ def test_an_enrollment_is_replaced_only_where_the_visitor_says_so(
     assert template_id() != meanwhile
     with demo.client() as client:
         assert client.delete("/v1/subjects/visitor").is_success
+
+
+def test_a_view_that_was_left_asks_nothing_more(open_tab: OpenTab, demo: Served) -> None:
+    """Neither whether to replace an enrollment, nor who has an id."""
+    tab = open_tab(demo)
+    page = tab.page
+    tab.open("Enroll")
+    tab.choose_drawn("person-1", 1)
+    tab.name_person("visitor")
+    pending = PendingRequests(page, "**/enrollment")
+    tab.press("Enroll")
+    waiting = pending.wait()
+    tab.open("People")
+    conflict = refused(409, "enrollment_conflict", "is enrolled", template_id="0" * 32)
+    waiting.fulfill(**conflict)
+    page.wait_for_timeout(300)
+    expect(page.get_by_role("dialog")).to_have_count(0)
+    tab.open("Verify")
+    page.get_by_label("Person’s id").evaluate(
+        "(input) => { input.value = 'left'; input.dispatchEvent(new Event('input'));"
+        " location.hash = '#/service'; }"
+    )
+    expect(page.get_by_role("heading", level=1, name="Service")).to_be_visible()
+    page.wait_for_timeout(400)
+    assert not [url for url in tab.requests if "prefix=left" in url]
+
+
+@pytest.mark.parametrize(
+    ("status", "code", "details", "says"),
+    [
+        (403, "forbidden", {"missing": ["verify"]}, "a key that has this right"),
+        (403, "forbidden", {"lowest_level": "fmr-1e-3"}, "Choose a stricter level"),
+        (403, "forbidden", {"tenant_setting": "x"}, "Switch private mode off"),
+        (403, "forbidden", {"liveness": "passive"}, "Reload the page"),
+        (403, "forbidden", {}, "Ask the operator whether this key may do it."),
+        (503, "model_unavailable", {}, "Try again in a moment."),
+    ],
+)
+def test_a_refusal_says_what_helps(
+    open_tab: OpenTab, demo: Served, status: int, code: str, details: dict[str, Any], says: str
+) -> None:
+    tab = open_tab(demo)
+    answer = refused(status, code, "it is refused", **details)
+    tab.page.route("**/verify", lambda route: route.fulfill(**answer))
+    tab.name_person("person-2")
+    tab.choose_drawn("person-2", 1)
+    tab.press("Verify")
+    tab.is_refused(code, says)
+    tab.complaints[:] = [each for each in tab.complaints if "status of 503" not in each]
+
+
+def test_a_lock_that_cannot_be_lifted_is_said_once(open_tab: OpenTab, demo: Served) -> None:
+    tab = open_tab(demo)
+    page = tab.page
+    locked, overloaded = refused(423, "locked_out", "x", wait=30), refused(429, "overloaded", "x")
+    page.route("**/verify", lambda route: route.fulfill(**locked))
+    page.route("**/lockout", lambda route: route.fulfill(**overloaded))
+    tab.name_person("person-2")
+    tab.choose_drawn("person-2", 1)
+    tab.press("Verify")
+    for _ in range(2):
+        with page.expect_response("**/lockout"):
+            tab.press("Lift the lock")
+    page.wait_for_timeout(200)
+    expect(page.get_by_role("alert")).to_have_count(2)
+
+
+def test_what_is_known_of_a_person_goes_with_the_id(open_tab: OpenTab, demo: Served) -> None:
+    enroll(demo, "three", "person-2", shots=3)
+    tab = open_tab(demo)
+    page = tab.page
+    tab.open("Enroll")
+    tab.choose_drawn("person-1", 1)
+    tab.name_person("three")
+    warning = page.get_by_text("1 photo would replace 3")
+    expect(warning).to_be_visible()
+    searches = PendingRequests(page, "**/v1/subjects?*")
+    tab.name_person("another")
+    expect(warning).to_have_count(0)
+    # A search that ends meanwhile leaves the button as it is.
+    search = searches.wait()
+    enrollment = PendingRequests(page, "**/enrollment")
+    tab.press("Enroll")
+    waiting = enrollment.wait()
+    search.continue_()
+    expect(page.get_by_text("New person.")).to_be_visible()
+    expect(page.locator("button[type=submit]")).to_have_text("Enrolling…")
+    expect(page.locator(".act-part .unseen[role=status]")).to_have_text("Enrolling…")
+    waiting.fulfill(**refused(429, "overloaded", "x"))
+    expect(page.locator("button[type=submit]")).to_have_text("Enroll")
+    with demo.client() as client:
+        assert client.delete("/v1/subjects/three").is_success
 
 
 def test_a_receipt_is_good_for_the_contract_beside_it(

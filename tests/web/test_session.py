@@ -3,6 +3,9 @@
 import pytest
 from playwright.sync_api import Route, expect
 
+from tests.patience import wait_until
+from tests.web.access import assert_accessible
+from tests.web.answers import PendingRequests, refused
 from tests.web.conftest import OpenTab
 from tests.web.served import Served
 
@@ -36,6 +39,45 @@ def test_a_reload_keeps_the_session_unless_that_is_not_wanted(
     assert demo.token not in page.content()
     assert not any(demo.token in url for url in tab.requests)
     assert demo.token not in demo.log.read_text()
+
+
+def test_a_key_is_kept_while_the_service_does_not_answer(open_tab: OpenTab, demo: Served) -> None:
+    tab = open_tab(demo, sign_in=None)
+    page = tab.page
+    tab.sign_in(demo.token, keep=True)
+    tab.open("People")
+    page.route("**/v1/key", lambda route: route.fulfill(**refused(429, "rate_limited", "later")))
+    page.reload()
+    tab.is_refused("rate_limited")
+    expect(page.get_by_label("API key")).to_have_count(0)
+    assert_accessible(tab, "not-signed-in-yet")
+    page.unroute("**/v1/key")
+    tab.press("Try again")
+    expect(page.get_by_role("heading", level=1, name="People")).to_be_focused()
+    page.route("**/v1/key", lambda route: route.fulfill(**refused(429, "rate_limited", "later")))
+    page.reload()
+    tab.press("Sign out")
+    expect(page.get_by_label("API key")).to_be_visible()
+    assert page.evaluate("sessionStorage.length") == 0
+
+
+def test_signing_out_ends_an_attempt_and_leaves_no_name_in_the_address(
+    open_tab: OpenTab, demo: Served
+) -> None:
+    tab = open_tab(demo)
+    page = tab.page
+    page.evaluate("location.hash = '#/verify/anna'")
+    expect(page.get_by_label("Person’s id")).to_have_value("anna")
+    tab.choose_drawn("person-2", 1)
+    pending = PendingRequests(page, "**/verify")
+    button = page.locator("form button[type=submit]").element_handle()
+    tab.press("Verify")
+    pending.wait()
+    tab.press("Sign out")
+    expect(page.get_by_label("API key")).to_be_visible()
+    assert page.url == tab.url
+    wait_until(lambda: button.text_content() == "Verify", what="the attempt has ended")
+    tab.complaints[:] = [each for each in tab.complaints if "ERR_ABORTED" not in each]
 
 
 def test_what_a_key_may_not_do_is_switched_off_with_the_reason(
@@ -83,7 +125,7 @@ def test_below_a_prefix_the_page_works_alike(open_tab: OpenTab, demo: Served) ->
     tab.choose_drawn("person-2", 1)
     tab.open("Service")
     expect(tab.page.get_by_text("Database and model are up")).to_be_visible()
-    expect(tab.page.get_by_text("3 photos, which are not kept")).to_be_visible()
+    expect(tab.page.get_by_text("3 photos, not kept")).to_be_visible()
     assert {url for url in tab.requests if not url.startswith(("blob:", tab.url))} == set()
 
 

@@ -205,7 +205,7 @@ def walk_service(tab: BrowserTab, demo: Served) -> Iterator[str]:
     expect(page.get_by_text("Database and model are up")).to_be_visible()
     expect(page.locator(".privacy")).to_contain_text("Privacy: not proven")
     expect(page.get_by_label("Person", exact=True)).to_have_value("person-2")
-    expect(page.get_by_text("3 photos, which are not kept")).to_be_visible()
+    expect(page.get_by_text("3 photos, not kept")).to_be_visible()
     yield "service"
     page.get_by_text("Geometry and contract").click()
     yield "service-opened"
