@@ -51,9 +51,9 @@ def verify(
     """Check the audit log, and keys and lockouts against it; exit status 1 if anything is wrong.
 
     Needs: the database and its master key; the service may run meanwhile. Names the first line that
-    was altered, removed, added or moved. If the log is whole, names API keys that were made up,
-    altered or put back, enrollments and tenants that were put back, settings of tenants that were
-    changed, and counts of failed attempts that were lowered. Lines in an archive are not used.
+    was altered, removed, added or moved; else API keys that were made up, altered or put back,
+    enrollments and tenants that were put back, changed settings of tenants, and lowered counts of
+    failed attempts. Lines in an archive are not used.
 
     Example: `veilface audit-log verify --anchor head.txt`
     """

@@ -79,9 +79,8 @@ def models(
 ) -> Result:
     """Time a pack, and say which `onnx_threads` and `compute_slots` suit this machine.
 
-    Needs: a pack. Run it where the service will run, and while little else runs there. Whole
-    photos are timed with one caller, with as many as there are processors, and with twice as many.
-    Takes some minutes.
+    Needs: a pack. Run it where the service will run, while little else runs there. Whole photos are
+    timed with one caller, one for each processor, and twice as many. Takes some minutes.
 
     Example: `veilface bench models --pack ~/.insightface/models/buffalo_l`
     """

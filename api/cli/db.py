@@ -91,10 +91,9 @@ def current(*, settings: Settings) -> Result:
 def compact(*, settings: Settings) -> Result:
     """Rewrite the database files, so that no page keeps erased data.
 
-    On PostgreSQL this is `VACUUM (FULL)` of the tables that hold subject data, which removes what
-    is left of erased rows and needs free disk as large as the data. On SQLite, which overwrites
-    erased rows at once, it is `VACUUM`, which gives free space back and needs as much free memory.
-    Writes wait meanwhile: run it when few requests come.
+    On PostgreSQL this is `VACUUM (FULL)` of the tables that hold subject data: it removes what is
+    left of erased rows and needs as much free disk. SQLite overwrites erased rows at once; its
+    `VACUUM` gives free space back and needs as much free memory. Writes wait meanwhile.
 
     Example: `veilface db compact --data-dir veilface-data`
     """
@@ -118,8 +117,7 @@ def unlock(
 ) -> Result:
     """Clear the failed attempts of a subject; exit status 1 if there are none.
 
-    It re-enables a subject that was disabled after many failures. Make sure first that it was the
-    subject who failed.
+    A disabled subject is enabled again. Make sure first that it was the subject who failed.
 
     Example: `veilface db unlock alice --tenant default`
     """
@@ -178,10 +176,10 @@ def template_enrollment(
 ) -> Result:
     """Allow or forbid a tenant's clients to enroll templates that they made themselves.
 
-    Forbidden by default. A template does not show how many people it holds: with a key for `enroll`
-    and `embeddings` one can enroll a template that accepts as many people as it has dimensions.
-    Allow it only if you trust the holders of such keys to say who somebody is. It takes effect at
-    once, in all workers; stored templates stay. An import needs no permission.
+    Forbidden by default: with a key for `enroll` and `embeddings` one could enroll a template that
+    accepts as many people as it has dimensions. Allow it only if you trust the holders of such keys
+    to say who somebody is. It takes effect at once, in all workers; stored templates stay. An
+    import needs no permission.
 
     Example: `veilface db template-enrollment --tenant default --allow`
     """
