@@ -237,7 +237,8 @@ def promises(roles: Roles, *, n: int) -> tuple[list[str], list[str]]:
         can.append(f"decoys like your people, by {len(roles.sample):,} photos of them")
     else:
         cannot.append(
-            "decoys like your people: that takes 300 photos of others of their kind (--like)"
+            "decoys like your people: that takes photos of others of their kind, better 600 or "
+            "more (--like)"
         )
     if len(roles.faces) < FACES_PER_DIMENSION * n:
         cannot.append(
