@@ -79,8 +79,8 @@ def templates(
     contract: Annotated[
         Path | None,
         typer.Option(
-            help="Audit this contract, with its thresholds and cohort. Unset: each scheme is "
-            "calibrated on people of PEOPLE who are not attacked."
+            help="Audit this contract, with its strategy, dimension, axes, thresholds and cohort. "
+            "Unset: each scheme is calibrated on people of PEOPLE who are not attacked."
         ),
     ] = None,
     strategy: Annotated[
