@@ -225,6 +225,7 @@ def exercise(material: Material, folder: Path, *, database_url: str) -> ServiceT
         "PYTHONUNBUFFERED": "1",
         "TMPDIR": str(folder / "tmp"),
         "VEILFACE_DATA_DIR": str(folder / "data"),
+        "VEILFACE_MASTER_KEY_FILE": str(folder / "data" / "master.key"),
         "VEILFACE_DATABASE_URL": database_url,
         "VEILFACE_PACK": str(material.pack_dir),
         "VEILFACE_LOG_LEVEL": "debug",
