@@ -18,6 +18,7 @@ from tests.clients.javascript.conftest import require_client
 from tests.clients.javascript.test_docs import EXAMPLE, OF_THE_CLIENT, OF_THE_ELEMENT
 from tests.clients.recorded import requests_in
 from tests.leaks import LeakSearch, as_bytes
+from tests.web.answers import refused
 from tests.web.browser_tab import BrowserTab
 from tests.web.camera import FakeCamera
 from tests.web.client_page import Application, application, for_browsers
@@ -181,11 +182,20 @@ def test_the_element(
         tab.page.get_by_role("button", name="Log in").click()
         expect(tab.page.locator("veilface-login output")).to_have_text(says)
         login.evaluate("(each) => each.reset()")
+    locked = refused(423, "locked_out", "too many failed attempts", wait=30)
+    locked["headers"]["Access-Control-Allow-Origin"] = "*"
+    tab.page.route("**/verify", lambda route: route.fulfill(**locked))
+    tab.page.get_by_role("button", name="Start camera").click()
+    tab.page.get_by_role("button", name="Log in").click()
+    output = tab.page.locator("veilface-login output")
+    expect(output).to_contain_text("An administrator can lift the lock.")
+    login.evaluate("(each) => each.reset()")
     camera.shows()
     tab.page.get_by_role("button", name="Start camera").click()
     tab.page.get_by_role("button", name="Log in").click()
-    expect(tab.page.locator("veilface-login output")).to_contain_text("No face was found")
-    assert said == ["undefined", "true", "false", "no_face"], "an enrollment is no decision"
+    expect(output).to_contain_text("No face was found")
+    told = [text for text in said if not text.startswith("Failed to load")]
+    assert told == ["undefined", "true", "false", "locked_out", "no_face"], "no decision at first"
 
 
 def test_the_element_locks_an_enrollment_to_a_passkey(
