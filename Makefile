@@ -13,7 +13,7 @@ PYTEST = OMP_NUM_THREADS=1 $(VENV)/pytest --numprocesses=$(WORKERS) --maxprocess
 # Bytecode is kept: without it, every process that a test starts compiles all that it imports.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo install extras docs test test-all lint types javascript javascript-package audit sbom platforms wheels lowest image release workflows lock clean
+.PHONY: demo install extras client docs test test-all lint types javascript javascript-package audit sbom platforms wheels lowest image release workflows lock clean
 
 demo: .venv/core
 	$(VENV)/veilface demo
@@ -25,6 +25,10 @@ install: .venv/core
 EXTRAS ?= all
 extras: .venv/core
 	$(UV) pip install --quiet --python $(VENV)/python --constraint requirements.lock -e ".[$(EXTRAS)]"
+
+# The Python client, into .venv: what examples/login/login.py needs.
+client: .venv/core
+	$(UV) pip install --quiet --python $(VENV)/python --constraint requirements.lock -e clients/python
 
 # What guards behaviour, in minutes.
 test: .venv/dev

@@ -76,7 +76,7 @@ def lift(
             "the middle and has twice the area of every other; `largest`, wherever it is; "
             "`single`, none."
         ),
-    ] = FacePolicy.SINGLE,
+    ] = FacePolicy.DOMINANT,
     holder_key_file: Annotated[
         Path | None,
         typer.Option(

@@ -84,7 +84,7 @@ def enroll(
         typer.Option(help="For a hybrid+ contract: used for lifting, never stored."),
     ] = None,
     tenant: Tenant = DEFAULT_TENANT,
-    face: Face = FacePolicy.SINGLE,
+    face: Face = FacePolicy.DOMINANT,
     holder_key_file: HolderKeyFile = None,
     new_holder_key_file: Annotated[
         Path | None,
@@ -163,7 +163,7 @@ class _Entrance:
     tenant: str
 
 
-_SEVERAL_FACES = "A photo that shows several faces is taken with --face dominant or largest."
+_SEVERAL_FACES = "A photo that shows several faces may be taken with --face largest."
 
 
 def _enrolled_all(
@@ -285,7 +285,7 @@ def verify(
         ),
     ] = None,
     tenant: Tenant = DEFAULT_TENANT,
-    face: Face = FacePolicy.SINGLE,
+    face: Face = FacePolicy.DOMINANT,
     holder_key_file: HolderKeyFile = None,
 ) -> Result:
     """Check whether photos show a person; exit status 0 if accepted, 1 if rejected.

@@ -104,7 +104,8 @@ def plain_lines(verdict: Verdict | None, *, strangers: bool = False) -> tuple[st
 
 def _plain_privacy(privacy: Judgement, strangers: bool) -> str:
     opened, proven = privacy.rate, privacy.status == "PASS"
-    said = "proven, against every attack that we know" if proven else "not proven"
+    of_whom = " for people like those of --faces" if strangers else ""
+    said = f"proven{of_whom}, against every attack that we know" if proven else "not proven"
     if opened.errors:
         share = (
             f"about {_one_in(opened, 'person', 'people')} could be recognised elsewhere "
@@ -117,9 +118,9 @@ def _plain_privacy(privacy: Judgement, strangers: bool) -> str:
         text += f" This is not enough to prove it: {privacy.shortfall}."
     if strangers:
         text += (
-            " The share is measured on people of --faces; of LFW's people, behind decoys of "
-            f"FairFace's faces, it was {STRANGERS_OPENED} (docs/privacy.md, November 2026). PEOPLE "
-            "like yours tell you more."
+            " The share is measured on people of --faces. Yours may be of another kind: of LFW's "
+            f"people, behind decoys of FairFace's faces, it was {STRANGERS_OPENED} "
+            "(docs/privacy.md, November 2026). Give PEOPLE like yours to measure it for them."
         )
     errors, trials = LIKE_OPENED
     if not proven and (privacy.shortfall is not None or opened.value > errors / trials):

@@ -119,9 +119,11 @@ def test_the_readme_logs_in_by_the_example(service: Service, tmp_path: Path) -> 
     (tmp_path / "examples").symlink_to(EXAMPLES)
     for number in (4, 5):
         (tmp_path / f"anna{number}.jpg").write_bytes(service.photo(1, number - 1))
-    made = "veilface keys create --right verify --label login --out login-key\n"
+    made = "veilface keys create --right verify --label login --out veilface-data-keys/login-key\n"
     assert made in block  # the deployment of the service is elsewhere
-    block = block.replace(made, f"echo {service.verifying} > login-key\n")
+    block = block.replace(
+        made, f"mkdir veilface-data-keys; echo {service.verifying} > veilface-data-keys/login-key\n"
+    )
     with Client(service.url, service.token) as client:
         client.enroll("anna", [service.photo(1, number) for number in range(3)])
         done = subprocess.run(
