@@ -402,7 +402,7 @@ def test_a_browser_sends_a_private_template_and_nothing_else_of_a_face(
         camera.shows(other[0])
         sign(page, "zoe", "Sign in")
         shown["camera of another"] = stand_before(page, "Log in")
-        said(page).to_have_text("That did not match. Try again.")
+        said(page).to_have_text("Not recognised. Try again.")
         told(page).to_have_text("Now show your face")
         assert status_of_account(page) == 401
 
