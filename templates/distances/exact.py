@@ -243,8 +243,7 @@ def _spherical_tile(
     b = products[:, : len(right)].reshape(*shape, templates.m, probes.m).swapaxes(2, 3)
     g = products[:, len(right) :]
     h = (p @ right.T.astype(np.float64)).reshape(*shape, templates.m)
-    dots, problem = _problem(
-        (p @ q.T).ravel(),
+    problem = _problem(
         (np.multiply.outer(s, t)[..., None, None] * b).reshape(-1, probes.m, templates.m),
         (s[:, None, None] * g).reshape(-1, probes.m),
         (t[:, None] * h).reshape(-1, templates.m),
@@ -252,9 +251,9 @@ def _spherical_tile(
     single = np.dtype(dtype) == np.float32
     still, near2 = (STILL, NEAR**2) if single else (_STILL, _NEAR2)
     gains = maximise(problem, starts_of(problem.gram), steps, still=still)[1]
-    squared = 2 - 2 * (dots + gains)
-    out = np.sqrt(np.maximum(squared, 0)).reshape(shape)
-    i, j = np.nonzero((squared < near2).reshape(shape))
+    squared = 2 - 2 * (p @ q.T + gains.reshape(shape))
+    out = np.sqrt(np.maximum(squared, 0))
+    i, j = np.nonzero(squared < near2)
     out[i, j] = pairs(probes, templates, i, j, metric=Metric.SPHERICAL, steps=steps)
     return out
 
@@ -301,20 +300,20 @@ class Problem(NamedTuple):
     """‖g‖² of g = s D q, shape (K, 1)."""
 
 
-def _problem(dots: Doubles, b: Doubles, g: Doubles, h: Doubles) -> tuple[Doubles, Problem]:
-    """Products p·q of K pairs, (K,), and their problems: the similarity is p·q + max F."""
+def _problem(b: Doubles, g: Doubles, h: Doubles) -> Problem:
+    """The problems of K pairs: their similarity is p·q + max F."""
     columns = b.transpose(0, 2, 1)
     g2 = np.einsum("ki,ki->k", g, g)[:, None]
-    return dots, Problem(columns @ b, _times(columns, g), h, g2)
+    return Problem(columns @ b, _times(columns, g), h, g2)
 
 
 def _problem_of(left: Rows, right: Rows) -> tuple[Doubles, Problem]:
-    """:func:`_problem` of K subspaces and as many others."""
+    """Products p·q of K subspaces and as many others, (K,), and their problems."""
     (scale, s), (their_scale, t) = spheres(left.feet), spheres(right.feet)
     p, q = left.feet * scale[:, None], right.feet * their_scale[:, None]
     b = (s * t)[:, None, None] * (left.bases @ right.bases.transpose(0, 2, 1))
     g, h = s[:, None] * _times(left.bases, q), t[:, None] * _times(right.bases, p)
-    return _problem(np.einsum("ki,ki->k", p, q), b, g, h)
+    return np.einsum("ki,ki->k", p, q), _problem(b, g, h)
 
 
 def starts_of(gram: Doubles) -> Doubles:
