@@ -140,8 +140,8 @@ def create_app(
     if settings.web_page:
         routes += page_routes(demo=settings.demo, serve_pack=settings.serve_pack)
         routes += reference_routes()
-    if settings.web_page and settings.demo:
-        routes += drawn_people_routes()
+        if settings.demo:
+            routes += drawn_people_routes()
     _add_middleware(app, settings)
     return app
 
