@@ -3,7 +3,7 @@
 A decision reads the subject's template, compares outside of any transaction, and is recorded in one
 write, before anybody is told of it: its token is used up, the lock is checked, the failure is
 counted, the audit log gets its line. If the template is another one by then, all of it is done
-again.
+again: a few times so, and then inside the write, where nobody can replace the template.
 
 Counts belong to the subject, enrolled or not. A second API key therefore gives no further attempts,
 and a lock does not show whether the subject is enrolled. They live in the database only, so that
@@ -14,13 +14,13 @@ import contextlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import timedelta
+from functools import partial
 from typing import Any, Protocol, TypeVar, cast
 
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 from sqlalchemy.orm import aliased
 
-from templates.errors import StoreBusy
 from templates.store.audit_log import By, Entry
 from templates.store.context import StoreContext
 from templates.store.identifiers import UnknownTenant, checked_subject_id
@@ -43,8 +43,8 @@ from templates.store.tenants import RetiredRotation
 
 COUNT_RETENTION = timedelta(days=90)
 """Time after the last failure until a count is forgotten; a disabled subject stays so."""
-TRIES = 5
-"""Times that a probe is decided while others replace the template before the record."""
+TRIES = 4
+"""Times that a probe is compared outside of the write, for which all other writes would wait."""
 
 
 @dataclass(frozen=True)
@@ -108,9 +108,10 @@ class Attempts:
         tenant, subject_id
             Whom the probe is compared with.
         compare
-            Makes the decision, outside of any transaction; called again where the template was
-            replaced meanwhile. It may raise :class:`RetiredRotation` for the same reason; what
-            else it raises is raised, and then nothing is written.
+            Makes the decision; called again where the template was replaced meanwhile, the last
+            time inside the write, so it must not write itself. It may raise
+            :class:`RetiredRotation` for the same reason; what else it raises is raised, and then
+            nothing is written.
         contract_id
             A template of another contract is treated as absent, and costs the same.
         token
@@ -121,19 +122,29 @@ class Attempts:
         Raises
         ------
         LockedOut, Replayed, UnknownTenant
-        StoreBusy
-            If the template changes again and again.
         SealError
             If the row was altered or moved, or its master key is missing.
         """
         parameters = self._parameters(tenant, subject_id, token=token, contract_id=contract_id)
+        database, read = self._context.database, partial(self._read, parameters)
+        record = partial(self._record, parameters, by)
+
+        def decide_in_write(connection: Connection) -> tuple[D, LockedOut | Replayed | None]:
+            attempt = read(connection)
+            decided = compare(attempt)
+            return decided, record(attempt, decided, connection)
+
         for _ in range(TRIES):
             with contextlib.suppress(Superseded, RetiredRotation):
-                attempt = self._read(parameters)
+                attempt = database.read(read)
                 decided = compare(attempt)
-                self._record(parameters, attempt, decided, by)
-                return decided
-        raise StoreBusy("the subject's template changes again and again: send the probe again")
+                refusal = database.write(partial(record, attempt, decided))
+                break
+        else:
+            decided, refusal = database.write(decide_in_write)
+        if refusal is not None:
+            raise refusal
+        return decided
 
     def reset(self, tenant: str, subject_id: str, *, by: By) -> bool:
         """Forget the consecutive failures on a subject, its lock and its being disabled.
@@ -179,14 +190,12 @@ class Attempts:
         statement = sa.delete(FailedAttemptsRow).where(due)
         return database.write(lambda connection: connection.execute(statement).rowcount)
 
-    def _read(self, parameters: Mapping[str, Any]) -> Attempt:
+    def _read(self, parameters: Mapping[str, Any], connection: Connection) -> Attempt:
         """Read all that a decision needs, and refuse early what :meth:`_record` would refuse.
 
         One query, and as many bytes, whether the subject is enrolled or not.
         """
-        row = self._context.database.read(
-            lambda connection: _row_of(connection, DECISION_QUERY, parameters)
-        )
+        row = _row_of(connection, DECISION_QUERY, parameters)
         if row.is_used:
             raise Replayed
         self._policy.refuse_locked(self._status(row), self._context.clock())
@@ -196,48 +205,52 @@ class Attempts:
         return Attempt(rotation_epoch=row.current_epoch, template=template)
 
     def _record(
-        self, parameters: Mapping[str, Any], attempt: Attempt, decided: Decided, by: By
-    ) -> None:
+        self,
+        parameters: Mapping[str, Any],
+        by: By,
+        attempt: Attempt,
+        decided: Decided,
+        connection: Connection,
+    ) -> LockedOut | Replayed | None:
+        """Record a decision inside a write; returns why it must be withheld, or None.
+
+        Raises
+        ------
+        Superseded
+            If the subject's template is not the one of `attempt`.
+        """
         template_id = None if attempt.template is None else attempt.template.template_id
         if decided.accepted and template_id is None:
             raise ValueError("a subject that is not enrolled cannot be accepted")
         pseudonym = parameters["pseudonym"]
-
-        def work(connection: Connection) -> LockedOut | Replayed | None:
-            row, now = _row_of(connection, RECORD_QUERY, parameters), self._context.clock()
-            status, spent = self._status(row), parameters["token"]
-            refusal: LockedOut | Replayed | None = None
-            outcome = "accept" if decided.accepted else "reject"
-            try:
-                if row.is_used:
-                    raise Replayed(recorded=True)
-                self._policy.refuse_locked(status, now)
-            except LockedOut as error:
-                outcome, refusal = "locked_out", LockedOut(error.retry_after_s, recorded=True)
-            except Replayed as error:
-                outcome, refusal, spent = "replayed", error, None
+        row, now = _row_of(connection, RECORD_QUERY, parameters), self._context.clock()
+        status, spent = self._status(row), parameters["token"]
+        refusal: LockedOut | Replayed | None = None
+        outcome = "accept" if decided.accepted else "reject"
+        try:
+            if row.is_used:
+                raise Replayed(recorded=True)
+            self._policy.refuse_locked(status, now)
+        except LockedOut as error:
+            outcome, refusal = "locked_out", LockedOut(error.retry_after_s, recorded=True)
+        except Replayed as error:
+            outcome, refusal, spent = "replayed", error, None
+        else:
+            stored = row.template_id if row.contract_id == parameters["contract_id"] else None
+            if stored != template_id:
+                raise Superseded
+            if not decided.accepted:
+                failed = (0, 0) if status is None else (status.consecutive, status.total)
+                new = self._policy.status(failed[0] + 1, failed[1] + 1, now)
+                _write_counts(connection, row, pseudonym, new)
             else:
-                stored = row.template_id if row.contract_id == parameters["contract_id"] else None
-                if stored != template_id:
-                    raise Superseded
-                if not decided.accepted:
-                    failed = (0, 0) if status is None else (status.consecutive, status.total)
-                    new = self._policy.status(failed[0] + 1, failed[1] + 1, now)
-                    _write_counts(connection, row, pseudonym, new)
-                else:
-                    use = {"of_subject": row.subject_pk, "last_used_at": now}
-                    connection.execute(_NOTE_USE, use)
-                    if status is not None and not status.is_clear:
-                        _write_counts(connection, row, pseudonym, status.cleared())
-            entry = Entry(
-                "verify", outcome, by, parameters["tenant"], pseudonym, decided.level, spent
-            )
-            self._context.audit_log.append(connection, entry)
-            return refusal
-
-        refusal = self._context.database.write(work)
-        if refusal is not None:
-            raise refusal
+                use = {"of_subject": row.subject_pk, "last_used_at": now}
+                connection.execute(_NOTE_USE, use)
+                if status is not None and not status.is_clear:
+                    _write_counts(connection, row, pseudonym, status.cleared())
+        entry = Entry("verify", outcome, by, parameters["tenant"], pseudonym, decided.level, spent)
+        self._context.audit_log.append(connection, entry)
+        return refusal
 
     def _status(self, row: Any) -> AttemptsStatus | None:
         if row.counted is None:
