@@ -30,7 +30,6 @@ from templates.contract.levels import LEVEL_NAME
 ENV_PREFIX = "VEILFACE_"
 CONFIG_VARIABLE = "VEILFACE_CONFIG"
 DEFAULT_CONFIG_FILE = Path("veilface.toml")
-MIB = 1024 * 1024
 DEFAULT_TENANT = "default"
 """Of the key that `veilface setup` makes, and of commands that name none."""
 OFF = "off"
@@ -88,7 +87,8 @@ class Settings(BaseSettings):
 
     data_dir: Path = Field(
         Path("veilface-data"),
-        description="Folder for everything that Veilface keeps except the master key.",
+        description="Folder for everything that Veilface keeps except the master key: "
+        "`contract.json`, `decoys.veil`, and the database where it is SQLite's.",
     )
     database_url: str | None = Field(
         None,
@@ -108,19 +108,10 @@ class Settings(BaseSettings):
         description="Name of an environment variable that holds the master keys in base64, the "
         "first is current, separated by commas or newlines; instead of `master_key_file`.",
     )
-    contract_file: Path | None = Field(
-        None,
-        description="The contract. Unset: `contract.json` in `data_dir`.",
-    )
     require_private: bool = Field(
         False,
         description="Refuse to start with a contract whose privacy is not proven: its verdict is "
         "not PASS.",
-    )
-    decoys_file: Path | None = Field(
-        None,
-        description="The decoy source; needed to enroll photos. Unset: `decoys.veil` in "
-        "`data_dir`, if it is there.",
     )
     pack: Path | None = Field(
         None,
@@ -213,25 +204,9 @@ class Settings(BaseSettings):
     lockout_after: int = Field(
         5,
         ge=0,
-        le=1000,
+        le=50,
         description="Rejected verifications of one subject in a row after which it is locked for "
-        "a while; 0: never.",
-    )
-    lockout_first_s: float = Field(
-        30.0,
-        gt=0,
-        le=86_400,
-        description="Seconds of the first lock; each further rejection doubles them.",
-    )
-    lockout_longest_s: float = Field(
-        3600.0, gt=0, le=31_536_000, description="Longest lock, in seconds."
-    )
-    lockout_disable_at: int = Field(
-        50,
-        ge=1,
-        le=1_000_000,
-        description="Rejected verifications in a row at which the subject is locked until an "
-        "operator resets it.",
+        "30 seconds, and twice as long with each further one (docs/rest.md); 0: never.",
     )
     retention_days: int | None = Field(
         None,
@@ -246,31 +221,11 @@ class Settings(BaseSettings):
         description="Days after its last accepted verification, or its enrollment, that a subject "
         "is erased. Unset: never.",
     )
-    max_request_bytes: int = Field(
-        32 * MIB, ge=1024, le=1024 * MIB, description="Largest request body, in bytes."
-    )
-    max_image_bytes: int = Field(
-        10 * MIB, ge=1024, le=256 * MIB, description="Largest photo, in bytes as sent."
-    )
-    max_image_pixels: int = Field(
-        24_000_000,
-        ge=10_000,
-        le=400_000_000,
-        description="Largest photo, in pixels; checked before decoding, which takes up to 17 "
-        "bytes a pixel.",
-    )
     export_key_file: Path | None = Field(
         None,
         description="File with the key for exports, mode 0600. Two deployments that share it "
         "can exchange subjects. Unset: a key kept in the database, which only this deployment "
         "can open.",
-    )
-    purge_interval_s: float = Field(
-        600.0,
-        ge=1,
-        le=86_400,
-        description="Seconds between two rounds in which a worker removes expired records and, "
-        "on SQLite, empties the write-ahead log; the first is at the start.",
     )
     log_level: Literal["debug", "info", "warning", "error"] = Field(
         "info", description="Least severe log line that is written."
@@ -387,20 +342,6 @@ class Settings(BaseSettings):
             raise ValueError("give tls_certificate and tls_key, or neither")
         return value
 
-    @field_validator("lockout_longest_s")
-    @classmethod
-    def _not_below_the_first(cls, value: float, info: ValidationInfo) -> float:
-        if value < info.data.get("lockout_first_s", value):
-            raise ValueError("must not be below lockout_first_s")
-        return value
-
-    @field_validator("lockout_disable_at")
-    @classmethod
-    def _not_before_a_lock(cls, value: int, info: ValidationInfo) -> int:
-        if value < info.data.get("lockout_after", 0):
-            raise ValueError("must not be below lockout_after")
-        return value
-
     @field_validator("master_key_variable")
     @classmethod
     def _one_source_of_keys(cls, value: str | None, info: ValidationInfo) -> str | None:
@@ -441,13 +382,13 @@ class Settings(BaseSettings):
 
     @property
     def resolved_contract_file(self) -> Path:
-        """The contract file, with the default filled in."""
-        return self.contract_file or self.data_dir / "contract.json"
+        """The contract file, which `veilface calibrate` writes."""
+        return self.data_dir / "contract.json"
 
     @property
     def resolved_decoys_file(self) -> Path:
-        """The decoy source's file, with the default filled in."""
-        return self.decoys_file or self.data_dir / "decoys.veil"
+        """The decoy source's file, which `veilface decoys build` writes."""
+        return self.data_dir / "decoys.veil"
 
     @property
     def allowed_origins(self) -> frozenset[str]:

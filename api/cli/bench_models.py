@@ -90,7 +90,7 @@ def models(
     if threads is None:
         threads = ",".join(str(count) for count in (1, 2, 4, 8) if count <= here)
     tried = listed_numbers(threads, "--threads", least=1, most=MAX_ONNX_THREADS)
-    own = {str(path): read_photo(path, settings.max_image_bytes) for path in photo or ()}
+    own = {str(path): read_photo(path) for path in photo or ()}
     packs = {
         count: ModelPack.load(settings.pack, providers=settings.providers, threads=count)
         for count in sorted({DEFAULT_THREADS, *tried})

@@ -140,8 +140,8 @@ def purge(
 ) -> Result:
     """Erase subjects whose retention period has ended, and remove expired records.
 
-    The service does this every `purge_interval_s` seconds. Each erased subject leaves a
-    receipt and a line in the audit log.
+    The service does this every ten minutes. Each erased subject leaves a receipt
+    and a line in the audit log.
 
     Example: `veilface db purge --retention-days 730 --retention-disuse-days 365 --dry-run`
     """

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from api.cli.errors import CommandError, UsageError
+from models.decoding import DEFAULT_LIMITS
 from templates.keys.private_file import read_at_most
 
 MAX_CONTRACT_BYTES = 2**28
@@ -17,7 +18,7 @@ def read_bounded(path: Path, most: int) -> bytes:
     return data
 
 
-def read_photo(path: Path, most: int) -> bytes:
+def read_photo(path: Path) -> bytes:
     """Read a photo that somebody named.
 
     Raises
@@ -26,7 +27,7 @@ def read_photo(path: Path, most: int) -> bytes:
         There is none.
     """
     try:
-        return read_bounded(path, most)
+        return read_bounded(path, DEFAULT_LIMITS.max_bytes)
     except FileNotFoundError:
         raise UsageError(f"no such photo: {path}") from None
 

@@ -11,7 +11,7 @@ from api.cli import master_keys
 from api.cli.console import message, progress
 from api.cli.errors import CommandError
 from api.cli.files import read_bounded
-from api.cli.master_keys import FILES, opened_store
+from api.cli.master_keys import opened_store
 from api.cli.options import STORE, Tenant
 from api.cli.public_key import PublicKey, read_public_key
 from api.cli.results import Result, Table, reports
@@ -196,7 +196,7 @@ def _shown_once(made: NewApiKey, what: str, out: Path | None, **facts: str) -> R
 
 
 @app.command("rotate-tenant")
-@reports(*FILES)
+@reports(*STORE)
 def rotate_tenant(
     *,
     settings: Settings,

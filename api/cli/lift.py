@@ -22,8 +22,6 @@ from templates.keys.holder_key import encode_holder_key, read_holder_key
 from templates.keys.private_file import replace_private
 from templates.space.agreement import InconsistentImages
 
-MAX_PHOTO_BYTES = 64 * 2**20
-
 
 @reports()
 def lift(
@@ -145,7 +143,7 @@ def lift(
 
 def embed_file(pack: ModelPack, photo: Path, *, policy: FacePolicy) -> np.ndarray[Any, Any]:
     """Embed one photo file; an error names the file. Returns float32 (n,), unit norm."""
-    data = read_photo(photo, MAX_PHOTO_BYTES)
+    data = read_photo(photo)
     try:
         return pack.embed_photo(data, policy=policy).embedding
     except ModelError as error:

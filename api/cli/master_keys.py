@@ -21,8 +21,6 @@ from templates.keys.sealing import MasterKeyring
 from templates.store import TemplateStore
 from templates.store.identifiers import utc_now
 
-FILES = (*STORE, "contract_file", "decoys_file")
-
 
 @reports("data_dir", "master_key_file")
 def master(*, settings: Settings) -> Result:
@@ -47,7 +45,7 @@ Retire = Annotated[
 ]
 
 
-@reports(*FILES)
+@reports(*STORE)
 def rotate(*, settings: Settings, retire: Retire = False) -> Result:
     """Put a new master key in force and rewrap everything under it.
 
@@ -64,7 +62,7 @@ def rotate(*, settings: Settings, retire: Retire = False) -> Result:
         return _rewrap(settings, keyring, store, retire=retire)
 
 
-@reports(*FILES)
+@reports(*STORE)
 def rewrap(*, settings: Settings, retire: Retire = False) -> Result:
     """Finish a rotation: rewrap whatever an older master key still wraps.
 
@@ -79,7 +77,7 @@ def rewrap(*, settings: Settings, retire: Retire = False) -> Result:
         return _rewrap(settings, keyring, store, retire=retire)
 
 
-@reports(*FILES, "export_key_file")
+@reports(*STORE, "export_key_file")
 def renew(
     archive: Annotated[Path, typer.Argument(help="New file for the audit log so far.")],
     *,

@@ -28,7 +28,7 @@ STORE = (
     "master_key_file",
     "master_key_variable",
 )
-LOCAL = (*STORE, "contract_file", "decoys_file", "pack", "providers", "onnx_threads")
+LOCAL = (*STORE, "pack", "providers", "onnx_threads")
 
 AsJson = Annotated[
     bool, typer.Option("--json", help="Write JSON to stdout; messages stay on stderr.")

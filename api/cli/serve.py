@@ -10,7 +10,7 @@ import typer
 
 from api.cli.console import demo_notice, message, say
 from api.cli.errors import CommandError
-from api.cli.options import takes_settings
+from api.cli.options import STORE, takes_settings
 from api.cli.verdict import private_mode_weakness, verdict_lines
 from api.limits.rates import RateLimits
 from api.service.opening import Deployment, key_beside_database, require_privacy
@@ -19,8 +19,15 @@ from api.service.server import listen, run_server, tls_options
 from api.settings import Settings
 from templates.decoys import DecoyGenerator
 
+FLAGS = (
+    *STORE,
+    *("pack", "providers", "workers", "host", "port", "tls_certificate", "tls_key"),
+    *("rate_limit_storage", "require_private", "liveness", "serve_pack"),
+)
+"""The settings that one changes by hand; the others come from the environment and the file."""
 
-@takes_settings(*Settings.model_fields)
+
+@takes_settings(*FLAGS)
 def serve(
     *,
     settings: Settings,

@@ -220,7 +220,7 @@ def _prepared(
 ) -> tuple[int, Enrollment]:
     """Make the template of some photos; returned with the epoch of its rotation."""
     runtime, pack, tenant = entrance.runtime, entrance.pack, entrance.tenant
-    data = [read_photo(photo, runtime.settings.max_image_bytes) for photo in photos]
+    data = [read_photo(photo) for photo in photos]
     epoch = runtime.epoch(tenant)
     with _named(photos):
         return epoch, runtime.enroller(tenant, epoch).from_photos(
@@ -229,7 +229,6 @@ def _prepared(
             attributes=attributes,
             holder=holder,
             policy=face,
-            limits=runtime.image_limits,
         )
 
 
@@ -300,7 +299,7 @@ def verify(
     if len(photos) > MAX_PROBE_PHOTOS:
         raise UsageError(f"a verification takes 1 to {MAX_PROBE_PHOTOS} photos, not {len(photos)}")
     holder_key = None if holder_key_file is None else read_holder_key(holder_key_file)
-    data = [read_photo(photo, settings.max_image_bytes) for photo in photos]
+    data = [read_photo(photo) for photo in photos]
     with _opened(settings, tenant) as entrance:
         runtime, pack, name = entrance.runtime, entrance.pack, entrance.tenant
         read = runtime.read(name, subject)
@@ -314,7 +313,7 @@ def verify(
         with _named(photos):
             probe = probe_of_photos(
                 pack, runtime.contract, data,
-                passive=False, policy=face, limits=runtime.image_limits,
+                passive=False, policy=face,
             )  # fmt: skip
         decision = verifier.decide_embedding(
             probe.embedding, template, holder_key=holder_key, level=level, photos=probe.photos

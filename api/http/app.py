@@ -245,7 +245,6 @@ async def _open(
         partial(
             purge_regularly,
             runtime.store,
-            every_s=settings.purge_interval_s,
             keep=retention_of(settings),
             on_failure=readiness.note,
         )

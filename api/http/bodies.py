@@ -21,11 +21,13 @@ from starlette.requests import Request
 from api.http.errors import ApiError, refuse_unknown_names, wrong_value
 from api.http.requests import Body, how_to_send
 from api.limits.admission import MAX_JSON_BYTES, read_limited, stream_limited
-from api.settings import Settings
+from models.decoding import DEFAULT_LIMITS
 from templates.contract.canonical import too_many_parts
 
 _FORM, _JSON = "multipart/form-data", "application/json"
 _MEDIA_TYPE = re.compile(r"[a-z0-9.+-]{1,63}/[a-z0-9.+-]{1,63}")
+MAX_REQUEST_BYTES = 32 * 2**20
+MAX_IMAGE_BYTES = DEFAULT_LIMITS.max_bytes
 MAX_FIELD_BYTES = 4096
 MAX_FIELDS = 16
 BODY_TIMEOUT_S = 60.0
@@ -45,16 +47,15 @@ class _InMemoryParser(MultiPartParser):
     # Python's SpooledTemporaryFile never moves to disk when its limit is 0.
     spool_max_size = 0
 
-    def __init__(self, request: Request, settings: Settings, most: int) -> None:
+    def __init__(self, request: Request, most: int) -> None:
         super().__init__(
             request.headers,
-            stream_limited(request, settings.max_request_bytes),
+            stream_limited(request, MAX_REQUEST_BYTES),
             max_files=float("inf"),
             max_fields=MAX_FIELDS,
             max_part_size=MAX_FIELD_BYTES,
         )
         self._most = most
-        self._max_image_bytes = settings.max_image_bytes
         self._image_bytes = 0
         self._complete = False
 
@@ -82,12 +83,12 @@ class _InMemoryParser(MultiPartParser):
     def on_part_data(self, data: bytes, start: int, end: int) -> None:
         if self._current_part.file is not None:
             self._image_bytes += end - start
-            if self._image_bytes > self._max_image_bytes:
+            if self._image_bytes > MAX_IMAGE_BYTES:
                 raise ApiError(
                     "image_too_large",
-                    f"photo {self._current_files} is larger than {self._max_image_bytes:,} bytes: "
+                    f"photo {self._current_files} is larger than {MAX_IMAGE_BYTES:,} bytes: "
                     "send a smaller copy",
-                    {"limit_bytes": self._max_image_bytes, "image": self._current_files - 1},
+                    {"limit_bytes": MAX_IMAGE_BYTES, "image": self._current_files - 1},
                 )
         super().on_part_data(data, start, end)
 
@@ -121,9 +122,7 @@ def _require_type(request: Request, media_type: str, how: str) -> None:
         )
 
 
-async def read_form(
-    request: Request, settings: Settings, model: type[B], *, photos: str, most: int
-) -> B:
+async def read_form(request: Request, model: type[B], *, photos: str, most: int) -> B:
     """Read a multipart body.
 
     Parameters
@@ -141,7 +140,7 @@ async def read_form(
     _require_type(request, _FORM, how_to_send(photos))
     with _arrives_within(BODY_TIMEOUT_S):
         try:
-            form = await _InMemoryParser(request, settings, most).parse()
+            form = await _InMemoryParser(request, most).parse()
         except (MultiPartException, UnicodeError, ValueError):
             raise ApiError(
                 "malformed_request",
@@ -164,9 +163,7 @@ async def read_form(
     return _checked(model, values, photos)
 
 
-async def read_json(
-    request: Request, settings: Settings, model: type[B], *, photos: str | None = None
-) -> B:
+async def read_json(request: Request, model: type[B], *, photos: str | None = None) -> B:
     """Read a JSON object, in UTF-8.
 
     ``NaN`` and infinities pass, so that an embedding that holds them is refused as such.
@@ -190,7 +187,7 @@ async def read_json(
         how = f"{how_to_send(photos)}, and what is no photo as application/json"
     _require_type(request, _JSON, how)
     with _arrives_within(BODY_TIMEOUT_S):
-        body = await read_limited(request, min(settings.max_request_bytes, MAX_JSON_BYTES))
+        body = await read_limited(request, MAX_JSON_BYTES)
     if too_many_parts(body, MAX_JSON_PARTS):
         raise ApiError(
             "malformed_request", f"the body holds more than {MAX_JSON_PARTS} values or commas"

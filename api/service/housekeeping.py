@@ -13,24 +13,25 @@ from templates.store import TemplateStore
 from templates.store.retention import Retention
 
 FOR_EVER = Retention()
+EVERY_S = 600.0
+"""Between two rounds."""
 
 
 async def purge_regularly(
     store: TemplateStore,
     *,
-    every_s: float,
     keep: Retention = FOR_EVER,
     on_failure: Callable[[Exception], None] = lambda _: None,
 ) -> None:
-    """Purge at once and then every ``every_s`` seconds, until it is cancelled.
+    """Purge at once and then every ``EVERY_S`` seconds, until it is cancelled.
 
     A failure is one log line: the next round tries again. Rounds vary by a tenth, so that workers
     that started together do not purge together.
 
     Parameters
     ----------
-    store, every_s
-        What is purged, and the time between two rounds.
+    store
+        What is purged.
     keep
         How long subjects are kept.
     on_failure
@@ -59,4 +60,4 @@ async def purge_regularly(
             PURGE_FAILURES.inc()
             on_failure(error)
             log("purge failed", severity=logging.WARNING, error_type=type(error).__name__)
-        await anyio.sleep(every_s * random.uniform(0.9, 1.1))
+        await anyio.sleep(EVERY_S * random.uniform(0.9, 1.1))

@@ -6,7 +6,7 @@ what is wrong with it, and what to do.
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import timedelta
 from pathlib import Path
 from typing import Self
@@ -28,6 +28,8 @@ from templates.store.database import Database
 from templates.store.lockout import LockoutPolicy
 from templates.store.retention import Retention
 from templates.store.schema import SecretRow
+
+LOCKOUT = LockoutPolicy()
 
 
 def database_in_use(url: str) -> bool:
@@ -192,7 +194,7 @@ def open_store(settings: Settings, keyring: MasterKeyring) -> TemplateStore:
         return TemplateStore(
             settings.resolved_database_url,
             keyring,
-            lockout=lockout_policy(settings),
+            lockout=replace(LOCKOUT, after=settings.lockout_after),
         )
     except (OSError, VeilfaceError) as error:
         raise StartError(f"the database cannot be opened: {error}") from None
@@ -216,16 +218,6 @@ def retention_of(settings: Settings) -> Retention:
         return None if number is None else timedelta(days=number)
 
     return Retention(days(settings.retention_days), days(settings.retention_disuse_days))
-
-
-def lockout_policy(settings: Settings) -> LockoutPolicy:
-    """Return what the settings say of failed attempts."""
-    return LockoutPolicy(
-        after=settings.lockout_after,
-        first_s=settings.lockout_first_s,
-        longest_s=settings.lockout_longest_s,
-        disable_at=settings.lockout_disable_at,
-    )
 
 
 def prepare_database(store: TemplateStore) -> None:
@@ -257,8 +249,7 @@ def open_contract(settings: Settings, keyring: MasterKeyring) -> Contract:
     path = settings.resolved_contract_file
     if not path.is_file():
         raise StartError(
-            f"there is no contract file {path}; `veilface calibrate` writes one "
-            "(setting contract_file)"
+            f"there is no contract file {path}; `veilface calibrate` writes one (setting data_dir)"
         )
     try:
         contract = Contract.load(path, file_sealer(keyring))
@@ -319,8 +310,7 @@ def open_decoys(
     path = settings.resolved_decoys_file
     if not path.is_file():
         raise StartError(
-            f"there is no decoys file {path}; `veilface decoys build` writes one "
-            "(setting decoys_file)"
+            f"there is no decoys file {path}; `veilface decoys build` writes one (setting data_dir)"
         )
     try:
         source = load_source(path, file_sealer(keyring)).reduced(contract.binding.axes)

@@ -30,7 +30,7 @@ from api.service.stand_in import SealedStandIn
 from api.settings import Settings
 from enroll import Enroller, Enrollment
 from enroll.enroller import WIRE_DTYPE
-from models.decoding import ImageLimits
+from models.decoding import DEFAULT_LIMITS
 from models.pack import ModelPack
 from templates.contract import wire
 from templates.contract.document import Contract
@@ -74,6 +74,7 @@ class Runtime(Deployment):
 
     pack: ModelPack | None
     operators_export_key: ExportKey | None
+    image_limits = DEFAULT_LIMITS
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
     _tenants: OrderedDict[tuple[str, int], InRotation] = field(
         default_factory=OrderedDict, repr=False
@@ -174,13 +175,6 @@ class Runtime(Deployment):
                 "operator to allow it (`veilface db template-enrollment --allow`)",
                 {"tenant_setting": "template_enrollment"},
             )
-
-    @property
-    def image_limits(self) -> ImageLimits:
-        """What a photo may cost before it is decoded, by the settings."""
-        return ImageLimits(
-            max_bytes=self.settings.max_image_bytes, max_pixels=self.settings.max_image_pixels
-        )
 
     def required_pack(self) -> ModelPack:
         """Return the pack.

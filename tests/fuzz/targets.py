@@ -223,13 +223,11 @@ def body(folder: Path) -> Target:
     from api.http.bodies import read_form, read_json
     from api.http.errors import ApiError
     from api.http.requests import VerifyForm, VerifyJson
-    from api.settings import load_settings
     from templates.errors import TemplateError
     from tests.fuzz import regressions
     from tests.fuzz.bodies import Bodies
 
     runner = asyncio.Runner()
-    settings = load_settings()
 
     def run(reading: Coroutine[Any, Any, Any]) -> Any:
         try:
@@ -250,9 +248,9 @@ def body(folder: Path) -> Target:
         headers = [(b"content-type", kind)]
         request = Request({"type": "http", "method": "POST", "headers": headers}, receive)
         if kind == b"application/json":
-            run(read_json(request, settings, VerifyJson))
+            run(read_json(request, VerifyJson))
         else:
-            form = run(read_form(request, settings, VerifyForm, photos="image", most=5))
+            form = run(read_form(request, VerifyForm, photos="image", most=5))
             demand(1 <= len(form.photos) <= 5, "no more photos than the limit")
 
     return Target(read, (ApiError, TemplateError), Bodies().make, 64, regressions.bodies())

@@ -121,7 +121,7 @@ def full_disk_run(
         folder,
         database_url=f"sqlite:///{database}",
         port=free_port(),
-        **{**QUIET, "purge_interval_s": 1},
+        **QUIET,
     )
     people = People(deployment, people_of(subjects))
     with Server(deployment, folder) as service:

@@ -58,7 +58,7 @@ def lockout_run(database_url: str | None, folder: Path, *, subjects: int) -> Rep
         folder,
         database_url=database_url,
         port=free_port(),
-        **{**QUIET, "lockout_after": LOCKOUT_AFTER, "lockout_first_s": 3600, "compute_slots": 4},
+        **{**QUIET, "lockout_after": LOCKOUT_AFTER, "compute_slots": 4},
     )
     people = People(deployment, [1, 2])
     with Server(deployment, folder) as service:

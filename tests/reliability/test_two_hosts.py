@@ -127,7 +127,7 @@ def sessions(cluster: Cluster, host: Host, condition: str) -> int:
 
 
 def test_two_hosts_decide_as_one(network: Network, cluster: Cluster, tmp_path: Path) -> None:
-    limits = {"lockout_after": LOCKOUT, "lockout_first_s": 3600, "rate_limit_key": f"{LIMIT}/day"}
+    limits = {"lockout_after": LOCKOUT, "rate_limit_key": f"{LIMIT}/day"}
     with two_hosts(network, cluster, tmp_path, **limits) as (first, second):
         decide_as_one(cluster, first, second)
 

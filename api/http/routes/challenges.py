@@ -28,7 +28,7 @@ async def create_challenge(call: Verifies) -> ChallengeAnswer:
     the token up.
     """
     async with call.place():
-        sent = await read_json(call.request, call.runtime.settings, ChallengeJson)
+        sent = await read_json(call.request, ChallengeJson)
     subject = sent.subject_id
     if call.token is not None:
         call.token.require("create_challenge", subject)

@@ -43,9 +43,7 @@ async def compare(call: Verifies) -> VerifyAnswer:
     async with call.place():
         runtime.required_pack()
         with step("body"):
-            sent = await read_form(
-                call.request, runtime.settings, CompareForm, photos="images", most=2
-            )
+            sent = await read_form(call.request, CompareForm, photos="images", most=2)
         level = runtime.levels.in_force(sent.level, lowest_of_key=call.key.lowest_level)
         runtime.liveness.require(photos=True, challenge=False)
         decision = await call.compute(lambda: _decide(call, sent, level))

@@ -45,7 +45,7 @@ async def enroll(
 
     A token for this subject may stand in the place of the API key; the enrollment uses it up.
     """
-    runtime, settings, tenant = call.runtime, call.runtime.settings, call.tenant
+    runtime, tenant = call.runtime, call.tenant
     request, token = call.request, call.token
     if token is not None:
         precondition = token.precondition(precondition)
@@ -53,11 +53,9 @@ async def enroll(
         sent: EnrollmentForm | EnrollmentJson
         if is_form(request):
             runtime.required_pack()
-            sent = await read_form(
-                request, settings, EnrollmentForm, photos="images", most=MAX_PHOTOS
-            )
+            sent = await read_form(request, EnrollmentForm, photos="images", most=MAX_PHOTOS)
         else:
-            sent = await read_json(request, settings, EnrollmentJson, photos="images")
+            sent = await read_json(request, EnrollmentJson, photos="images")
             # After the fields: who only forgot how to send a photo needs no further right.
             call.require("embeddings")
             await call.query(lambda: runtime.require_template_enrollment(tenant))

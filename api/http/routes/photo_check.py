@@ -32,9 +32,7 @@ async def check_photo(call: EnrollsOrVerifies) -> PhotoCheckAnswer:
     async with call.place():
         pack = runtime.required_pack()
         with step("body"):
-            sent = await read_form(
-                call.request, runtime.settings, PhotoCheckForm, photos="image", most=1
-            )
+            sent = await read_form(call.request, PhotoCheckForm, photos="image", most=1)
 
         def work() -> PhotoCheckAnswer:
             limits = runtime.image_limits

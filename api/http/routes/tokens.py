@@ -33,7 +33,7 @@ async def create_token(call: AnyCall) -> TokenAnswer:
     """
     runtime = call.runtime
     async with call.place():
-        asked = await read_json(call.request, runtime.settings, TokenJson)
+        asked = await read_json(call.request, TokenJson)
     pseudonym = call.note_subject(asked.subject_id)
     call.require(asked.action)
     level = None

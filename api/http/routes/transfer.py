@@ -63,7 +63,7 @@ async def import_subject(
     call.require("admin")
     runtime = call.runtime
     async with call.place():
-        sent = await read_json(call.request, runtime.settings, ImportJson)
+        sent = await read_json(call.request, ImportJson)
         exported = await call.query(
             lambda: open_export(
                 sent.export,

@@ -123,15 +123,15 @@ def answer_of(call: Call, decision: Decision, *, probe: str) -> VerifyAnswer:
 
 async def _sent(call: Call) -> VerifyForm | VerifyJson:
     """Read the probe, and refuse what can be refused without decoding anything."""
-    request, runtime, settings = call.request, call.runtime, call.runtime.settings
+    request, runtime = call.request, call.runtime
     if not is_form(request):
-        sent = await read_json(request, settings, VerifyJson, photos="image")
+        sent = await read_json(request, VerifyJson, photos="image")
         # After the fields: who only forgot how to send a photo needs no further right.
         call.require("embeddings")
         runtime.liveness.require(photos=False, challenge=False)
         return sent
     runtime.required_pack()
-    form = await read_form(request, settings, VerifyForm, photos="image", most=MAX_FRAMES)
+    form = await read_form(request, VerifyForm, photos="image", most=MAX_FRAMES)
     answers = form.challenge_id is not None
     most = MAX_FRAMES if answers else MAX_PROBE_PHOTOS
     if len(form.photos) > most:

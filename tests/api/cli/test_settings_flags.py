@@ -1,4 +1,3 @@
-import inspect
 import os
 
 import pytest
@@ -7,7 +6,6 @@ from typer.testing import CliRunner
 
 from api.cli.errors import Commands
 from api.cli.options import takes_settings
-from api.cli.serve import serve
 from api.settings import CONFIG_VARIABLE, Settings
 
 
@@ -67,7 +65,3 @@ def test_a_wrong_setting_is_one_sentence(tmp_path):
 def test_a_command_takes_the_settings_it_names_and_no_other():
     result = ran("--port", "80", names=("data_dir",))
     assert result.exit_code == 2
-
-
-def test_serve_takes_every_setting():
-    assert set(Settings.model_fields) <= set(inspect.signature(serve).parameters)

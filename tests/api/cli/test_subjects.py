@@ -209,7 +209,7 @@ def test_a_verification_without_a_decision_is_no_rejection(world, veilface, tmp_
         ((*ann, *world.photos(1, range(5)), *pack), 2, "1 to 5 photos"),
         (("verify", "ann", tmp_path, *pack), 3, "Is a directory"),
         ((*ann, "--pack", absent), 3, "does not exist"),
-        ((*ann, *pack, "--contract-file", absent), 3, "there is no contract file"),
+        ((*ann, *pack, "--data-dir", absent), 3, "there is no contract file"),
         ((*ann, *pack, "--tenant", "elsewhere"), 3, "no tenant"),
         ((*ann, *pack, "--database-url", f"sqlite:///{absent}/no.db"), 3, "database"),
         ((*ann, *pack, "--database-url", "postgresql://127.0.0.1:1/no"), 3, "database"),

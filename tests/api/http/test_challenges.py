@@ -14,6 +14,7 @@ from api.http.app import create_app
 from api.http.errors import StartError
 from api.service.runtime import Runtime
 from models.pack import ModelPack
+from templates.store.lockout import LockoutPolicy
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, deploy, images, photo
 from tests.api.living import (
@@ -304,8 +305,11 @@ def test_a_challenge_of_a_token_and_the_token_are_used_up_together(active: Servi
     assert liveness(attempt(asked, others)) == PASSED
 
 
-def test_failures_of_a_challenge_lock_after_five(tmp_path: Any) -> None:
-    for client, _ in serve(tmp_path, liveness="active", lockout_after=5, lockout_first_s=3600):
+def test_failures_of_a_challenge_lock_after_five(
+    tmp_path: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("api.service.opening.LOCKOUT", LockoutPolicy(first_s=3600))
+    for client, _ in serve(tmp_path, liveness="active", lockout_after=5):
         still = frames_of(["front"] * 5)
         for _ in range(5):
             told = answered(client, challenge(client)["challenge_id"], still)

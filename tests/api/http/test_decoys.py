@@ -36,7 +36,7 @@ def test_a_service_starts_with_decoys_of_its_contracts_space_only(
     deployment: Deployment, tmp_path: Path
 ) -> None:
     keyring = open_keyring(deployment.settings)
-    settings = deployment.settings.model_copy(update={"decoys_file": tmp_path / "decoys.veil"})
+    settings = deployment.settings.model_copy(update={"data_dir": tmp_path})
     for made_with in (None, deployment.contract.binding.embedding_id):
         source = made(made_with)
         source.save(tmp_path / "decoys.veil")

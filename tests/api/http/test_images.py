@@ -10,6 +10,8 @@ import pytest
 from PIL import Image
 
 from api.http.app import create_app
+from api.service.runtime import Runtime
+from models.decoding import ImageLimits
 from tests.api.awkward import Case, bombs, damaged, encode, no_pictures, scenes, unusual
 from tests.api.client import Client
 from tests.api.deployment import (
@@ -48,12 +50,18 @@ def failures(client: Client, cases: list[Case]) -> list[str]:
     return wrong
 
 
+@pytest.fixture(scope="module", autouse=True)
+def smaller_photos() -> Iterator[None]:
+    """Bombs of so few pixels take a second less each to make."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Runtime, "image_limits", ImageLimits(max_pixels=MAX_PIXELS))
+        yield
+
+
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Client]:
     """With the tiny pack, which takes any square picture for an aligned face."""
-    deployment = deploy(
-        tmp_path_factory.mktemp("plain"), max_image_pixels=MAX_PIXELS, lockout_after=0
-    )
+    deployment = deploy(tmp_path_factory.mktemp("plain"), lockout_after=0)
     with Client(create_app(deployment.settings), headers=bearer(deployment.token)) as client:
         put = client.put("/v1/subjects/a/enrollment", files=images(encoded(picture(1))))
         assert put.status_code == 201
@@ -108,12 +116,7 @@ def real(
     faces: list[np.ndarray[Any, Any]],
 ) -> Iterator[Client]:
     """With a real detector and a real embedder; the thresholds are not calibrated."""
-    deployment = deploy(
-        tmp_path_factory.mktemp("real"),
-        pack=mbf_pack_dir,
-        max_image_pixels=MAX_PIXELS,
-        lockout_after=0,
-    )
+    deployment = deploy(tmp_path_factory.mktemp("real"), pack=mbf_pack_dir, lockout_after=0)
     with Client(create_app(deployment.settings), headers=bearer(deployment.token)) as client:
         put = client.put("/v1/subjects/a/enrollment", files=images(encoded(faces[0])))
         assert put.status_code == 201, put.text

@@ -12,6 +12,7 @@ import pytest
 
 from api.http.app import create_app
 from api.http.schemas import LockoutAnswer, UnlockAnswer, VerifyAnswer
+from templates.store.lockout import LockoutPolicy
 from tests.api.calls import AFTER, attempt, enroll, fail
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, deploy, images, photo
@@ -22,10 +23,13 @@ FIRST_S = 3600
 
 
 @pytest.fixture
-def both(tmp_path: Path, database_url: str) -> Iterator[tuple[Client, Deployment]]:
+def both(
+    tmp_path: Path, database_url: str, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[tuple[Client, Deployment]]:
     """As elsewhere, with locks that outlast every test, however long a busy machine takes."""
     migrate_ahead(database_url)
-    deployment = deploy(tmp_path, database_url=database_url, lockout_first_s=FIRST_S)
+    monkeypatch.setattr("api.service.opening.LOCKOUT", LockoutPolicy(first_s=FIRST_S))
+    deployment = deploy(tmp_path, database_url=database_url)
     with Client(create_app(deployment.settings)) as running:
         running.headers.update(bearer(deployment.token))
         yield running, deployment
@@ -155,9 +159,12 @@ def test_the_lock_outlives_a_restart_and_an_operator_lifts_it(
     assert attempt(client, token, 1).json()["decision"] == "accept"
 
 
-def test_a_disabled_subject_waits_for_an_operator(tmp_path: Path) -> None:
-    own = deploy(tmp_path, lockout_after=3, lockout_first_s=1e-6, lockout_longest_s=1e-6,
-                 lockout_disable_at=6)  # fmt: skip
+def test_a_disabled_subject_waits_for_an_operator(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    policy = LockoutPolicy(first_s=1e-6, longest_s=1e-6, disable_at=6)
+    monkeypatch.setattr("api.service.opening.LOCKOUT", policy)
+    own = deploy(tmp_path, lockout_after=3)
     with Client(create_app(own.settings), headers=bearer(own.token)) as client:
         enroll(client)
         token = own.key("verify")

@@ -15,12 +15,11 @@ from starlette.responses import Response
 from starlette.types import Message, Receive, Scope, Send
 
 from api.http import bodies
-from api.http.bodies import MAX_FIELD_BYTES, MAX_JSON_PARTS, read_json
+from api.http.bodies import MAX_FIELD_BYTES, MAX_IMAGE_BYTES, MAX_JSON_PARTS, read_json
 from api.http.context import RequestContext
 from api.http.errors import ApiError
 from api.http.requests import EnrollmentJson
 from api.limits.admission import MAX_JSON_BYTES, Gate
-from api.settings import load_settings
 from tests.api.client import Client
 from tests.api.deployment import Deployment, images, photo
 from tests.api.shapes import assert_error
@@ -75,9 +74,9 @@ def test_json_has_a_limit_of_its_own(client: Client) -> None:
 
 
 def test_an_image_may_be_as_large_as_the_limit_and_no_larger(
-    client: Client, deployment: Deployment
+    client: Client,
 ) -> None:
-    limit = deployment.settings.max_image_bytes
+    limit = MAX_IMAGE_BYTES
     fits = client.put(ENROLL, files=images(padded(limit)))
     assert fits.status_code in (200, 201)
     details = assert_error(
@@ -163,7 +162,7 @@ def test_a_body_that_does_not_arrive_is_given_up(monkeypatch: pytest.MonkeyPatch
 
         request = Request({"type": "http", "headers": JSON}, receive)
         with pytest.raises(ApiError, match="did not arrive") as caught:
-            await read_json(request, load_settings(), EnrollmentJson)
+            await read_json(request, EnrollmentJson)
         assert caught.value.code == "malformed_request"
 
     anyio.run(never)
@@ -260,7 +259,7 @@ def test_large_json_is_parsed_in_a_thread(
 
     async def read() -> Any:
         request = Request({"type": "http", "headers": JSON}, receive)
-        return await read_json(request, load_settings(), EnrollmentJson)
+        return await read_json(request, EnrollmentJson)
 
     assert anyio.run(read).template == bytes(3 * size // 4)
     assert [thread != threading.get_ident() for thread in parsed_by] == [apart]

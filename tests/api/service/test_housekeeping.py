@@ -18,9 +18,14 @@ from tests.api.deployment import Deployment, bearer, deploy, images, photo
 from tests.patience import wait_until
 
 
+@pytest.fixture(autouse=True)
+def often(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("api.service.housekeeping.EVERY_S", 1)
+
+
 @pytest.fixture
 def own(tmp_path: Path) -> Deployment:
-    return deploy(tmp_path, purge_interval_s=1)
+    return deploy(tmp_path)
 
 
 def records(store: TemplateStore) -> int:
@@ -87,7 +92,7 @@ def test_a_purge_that_fails_is_a_log_line(
 def test_subjects_whose_time_is_over_go_by_themselves(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    own = deploy(tmp_path, purge_interval_s=1, retention_days=30)
+    own = deploy(tmp_path, retention_days=30)
     with Client(create_app(own.settings)) as client:
         client.headers.update(bearer(own.token))
         for name in ("old", "young"):

@@ -13,6 +13,7 @@ from pathlib import Path
 import httpx
 import pytest
 
+from api.http.bodies import MAX_IMAGE_BYTES
 from api.http.errors import DatabaseAway
 from api.service.server import RETRY_S, open_patiently
 from tests.api.deployment import bearer, deploy, environment_of, images, photo
@@ -84,8 +85,7 @@ def test_workers_share_the_database_and_nothing_else(server: Server) -> None:
 
 
 def test_a_large_body_gets_its_answer(server: Server, http: httpx.Client) -> None:
-    limits = server.deployment.settings
-    image = photo(1) + b"\x00" * limits.max_image_bytes
+    image = photo(1) + b"\x00" * MAX_IMAGE_BYTES
     answer = http.put("/v1/subjects/a/enrollment", files=images(image))
     assert_error(answer, 413, "image_too_large")
     answer = http.put("/v1/subjects/a/enrollment", files=images(*[image[:-100_000]] * 5))

@@ -173,8 +173,9 @@ def test_decoys_of_another_contract(fresh: Deployment) -> None:
     assert "decoys file" in refused(fresh.settings)
 
 
-def test_decoys_that_are_named_and_absent(fresh: Deployment, tmp_path: Path) -> None:
-    assert "nowhere" in refused(changed(fresh, decoys_file=tmp_path / "nowhere"))
+def test_absent_decoys(fresh: Deployment) -> None:
+    fresh.settings.resolved_decoys_file.unlink()
+    assert "there is no decoys file" in refused(fresh.settings)
 
 
 @pytest.mark.parametrize(
