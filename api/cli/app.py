@@ -31,7 +31,7 @@ COMMANDS = {
     "(ISO/IEC 30107-3).",
     "audit": "Attack private templates, and hold the results against your limits.",
     "decoys": "Make the decoys that hide an embedding inside its private template.",
-    "keys": "Create, replace and revoke API keys; rotate keys; verify erasure receipts.",
+    "keys": "Create and revoke API keys; rotate keys; verify erasure receipts.",
     "models": "Fetch and inspect model packs (the weights you supply).",
     "db": "Migrate, check and clean up the database; set up tenants.",
     "audit-log": "Verify, read and archive the audit log, a chain of lines.",

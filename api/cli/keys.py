@@ -40,7 +40,7 @@ app = typer.Typer(no_args_is_help=True)
 
 @app.callback()
 def keys() -> None:
-    """Create, replace and revoke API keys; rotate keys; verify erasure receipts."""
+    """Create and revoke API keys; rotate keys; verify erasure receipts."""
 
 
 for _command in (
@@ -148,38 +148,8 @@ def revoke(
     return Result(facts, f"Key {prefix} is revoked.")
 
 
-@app.command()
-@reports(*STORE)
-def replace(
-    prefix: Annotated[
-        str,
-        typer.Argument(help="The 12 digits after `vf_` of the old key."),
-    ],
-    *,
-    settings: Settings,
-    grace_hours: Annotated[
-        float,
-        typer.Option(min=0, max=8760, help="Hours for which the old key still works."),
-    ] = 24.0,
-    out: KeyFile = None,
-) -> Result:
-    """Replace a key, which then expires, by a new one with the same rights; show it once.
-
-    The new key keeps the tenant, label and lowest level. Hand it over before the grace period ends;
-    after a leak use `--grace-hours 0`. Exit status 1 if no valid key has this prefix.
-
-    Example: `veilface keys replace 3f9a1c0b7d2e --grace-hours 48`
-    """
-    _require_new(out)
-    with opened_store(settings) as store:
-        made = store.api_keys.replace(prefix, grace=timedelta(hours=grace_hours), by=operator())
-    if made is None:
-        raise CommandError("no valid key of this prefix; see `veilface keys list`")
-    return _shown_once(made, f"Key {made.key.prefix} replaces {prefix}", out, replaces=prefix)
-
-
 def _require_new(out: Path | None) -> None:
-    """Refuse a file that cannot be made, before a key is made or replaced for it."""
+    """Refuse a file that cannot be made, before a key is made for it."""
     if out is not None and (out.exists() or not out.parent.is_dir()):
         why = "exists already" if out.exists() else "lies in a folder that does not exist"
         raise CommandError(f"{out} {why}: name another file with --out")

@@ -88,7 +88,7 @@ def renew(
     Stop the service first, and start it again afterwards. Puts a new master key in force and drops
     the old one; moves the audit log into a signed archive; renews the keys of receipts, exports,
     API keys and the audit log, and every tenant's rotation key. Then lists who must enroll again,
-    and which API keys to replace. If the master keys do not come from a file, put a new one in
+    and which API keys to make anew. If the master keys do not come from a file, put a new one in
     front at their source first, and drop the old one afterwards.
 
     Example: `veilface keys renew audit-before-theft.jsonl`
@@ -130,8 +130,8 @@ def renew(
         text += [f"    {subject}" for subject in subjects]
         text.append(f"  Then run `veilface keys rotate-tenant --tenant {name} --stolen --finish`.")
     if api_keys:
-        text.append("- Replace these API keys, and revoke those that nobody knows:")
-    text += [f"    veilface keys replace {prefix} --grace-hours 0" for prefix in api_keys]
+        text.append("- Make others (`veilface keys create`) in place of these API keys:")
+    text += [f"    veilface keys revoke {prefix}" for prefix in api_keys]
     if settings.export_key_file is not None:
         text.append("- Make another export key file, if it was stolen too.")
     if not is_from_file(settings):

@@ -123,7 +123,16 @@ class ApiKeys:
             raise StoreError(f"a label has at most {MAX_LABEL} printable characters")
         if lowest_level is not None and not LEVEL_NAME.fullmatch(lowest_level):
             raise StoreError("the lowest level of a key is the name of a level, such as fmr-1e-4")
-        key = self._drawn(tenant, granted, label, expires_at, lowest_level)
+        key = ApiKey(
+            id=uuid.uuid4().hex,
+            prefix=os.urandom(6).hex(),
+            tenant=tenant,
+            rights=granted,
+            label=label,
+            created_at=self._context.clock(),
+            expires_at=expires_at,
+            lowest_level=lowest_level,
+        )
         return self._context.database.write(lambda connection: self._insert(connection, key, by))
 
     def verify(self, token: str) -> ApiKey | None:
@@ -179,50 +188,9 @@ class ApiKeys:
                 entry = Entry("key-revoke", "revoked_before", by, row.tenant, detail=prefix)
             else:
                 entry = Entry("key-revoke", "revoked", by, row.tenant, detail=prefix)
-                self._change(connection, row, revoked_at=self._context.clock())
+                self._revoke(connection, row)
             self._context.audit_log.append(connection, entry)
             return entry.outcome == "revoked"
-
-        return self._context.database.write(work)
-
-    def replace(self, prefix: str, *, grace: timedelta, by: By = PROGRAM) -> NewApiKey | None:
-        """Make a key in place of another one, which stays valid for a while.
-
-        The new key has the tenant, rights, label, expiry and lowest level of the old one, so
-        replacing a key does not prolong or widen what was granted. The line of the audit log holds
-        the old key's prefix and when that ends.
-
-        Parameters
-        ----------
-        prefix
-            Of the key that goes.
-        grace
-            How long it stays valid, for its users to change over; never longer than before.
-        by
-            Who asks for it, for the audit log.
-
-        Returns
-        -------
-        NewApiKey or None
-            None if there is no valid key of this prefix.
-        """
-        if grace < timedelta(0):
-            raise StoreError("the time that an old key stays valid is nothing or more")
-
-        def work(connection: Connection) -> NewApiKey | None:
-            now = self._context.clock()
-            row = connection.execute(_OF_PREFIX, {"prefix": prefix}).one_or_none()
-            old = None if row is None else self._read(row)
-            if old is None or not old.is_valid_at(now):
-                return None
-            fresh = self._drawn(old.tenant, old.rights, old.label, old.expires_at, old.lowest_level)
-            new = self._insert(connection, fresh, by)
-            ends = _sooner(old.expires_at, now, grace)
-            self._change(connection, row, expires_at=ends)
-            detail = prefix if ends is None else f"{prefix} {ends.isoformat()}"
-            entry = Entry("key-replace", "replaced", by, old.tenant, detail=detail)
-            self._context.audit_log.append(connection, entry)
-            return new
 
         return self._context.database.write(work)
 
@@ -283,25 +251,6 @@ class ApiKeys:
         expected = _mac(self._context.secrets.get(SecretName.API_KEYS), row._mapping)
         return hmac.compare_digest(expected, row.mac)
 
-    def _drawn(
-        self,
-        tenant: str,
-        rights: frozenset[Right],
-        label: str,
-        expires_at: datetime | None = None,
-        lowest_level: str | None = None,
-    ) -> ApiKey:
-        return ApiKey(
-            id=uuid.uuid4().hex,
-            prefix=os.urandom(6).hex(),
-            tenant=tenant,
-            rights=rights,
-            label=label,
-            created_at=self._context.clock(),
-            expires_at=expires_at,
-            lowest_level=lowest_level,
-        )
-
     def _insert(self, connection: Connection, key: ApiKey, by: By) -> NewApiKey:
         token = f"vf_{key.prefix}_{os.urandom(32).hex()}"
         row: dict[str, Any] = {
@@ -317,8 +266,9 @@ class ApiKeys:
         self._context.audit_log.append(connection, entry)
         return NewApiKey(key=key, token=token)
 
-    def _change(self, connection: Connection, row: Any, **columns: Any) -> None:
-        """Change columns of a row; one that is not authentic stays so."""
+    def _revoke(self, connection: Connection, row: Any) -> None:
+        """Note the moment in a row; one that is not authentic stays so."""
+        columns: dict[str, Any] = {"revoked_at": self._context.clock()}
         if self._is_authentic(row):
             secret = self._context.secrets.get(SecretName.API_KEYS)
             columns["mac"] = _mac(secret, {**row._mapping, **columns})
@@ -370,15 +320,6 @@ def _part(value: object) -> str | bytes | int:
             return value
         case _:
             return 0  # NULL; no column that may be NULL holds a number
-
-
-def _sooner(expires_at: datetime | None, now: datetime, grace: timedelta) -> datetime | None:
-    """When a key expires that has only so long left, and not longer than it had."""
-    try:
-        limit = now + grace
-    except OverflowError:
-        return expires_at
-    return limit if expires_at is None else min(expires_at, limit)
 
 
 @functools.lru_cache(maxsize=256)

@@ -13,7 +13,7 @@ import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
 from templates.errors import StoreError
-from templates.store.api_keys import ApiKey, ApiKeys
+from templates.store.api_keys import ApiKeys
 from templates.store.attempts import COUNT_RETENTION
 from templates.store.audit_chain import Anchor
 from templates.store.audit_log import TENANT_ERASE, Verification, template_digest
@@ -21,7 +21,7 @@ from templates.store.context import StoreContext
 from templates.store.schema import FailedAttemptsRow, SubjectRow, TemplateRow, TenantRow
 
 KEY_ALTERED = "the row of an API key was made up or altered"
-KEY_PUT_BACK = "an API key that was revoked, replaced or erased was put back"
+KEY_PUT_BACK = "an API key that was revoked was put back"
 ENROLLMENT_PUT_BACK = "an enrollment that was erased or replaced was put back"
 TENANT_PUT_BACK = "a tenant that was erased was put back"
 TENANT_ALTERED = "a setting of a tenant was changed"
@@ -57,7 +57,6 @@ class LogFindings:
     """What the lines of the log tell, up to the last one that was read."""
 
     ended_keys: set[str] = field(default_factory=set)
-    replaced_keys: dict[str, datetime] = field(default_factory=dict)
     erased_tenants: set[str] = field(default_factory=set)
     settings: dict[str, bool] = field(default_factory=dict)
     failures: dict[str, _Failures] = field(default_factory=dict)
@@ -69,11 +68,6 @@ class LogFindings:
         pseudonym, detail = line["pseudonym"], line["detail"]
         if action == "key-revoke" and outcome == "revoked":
             self.ended_keys.add(detail)
-        elif action == "key-replace":
-            prefix, _, ends = detail.partition(" ")
-            if ends:
-                until = datetime.fromisoformat(ends)
-                self.replaced_keys[prefix] = min(until, self.replaced_keys.get(prefix, until))
         elif action == "tenant-settings":
             self.settings[tenant] = outcome == "template-enrollment-on"
         elif action == TENANT_ERASE and outcome == "erased":
@@ -147,7 +141,7 @@ def _keys(findings: LogFindings, api_keys: ApiKeys, connection: Connection) -> l
     for key in keys:
         if not key.authentic:
             problems.append(RecordProblem(KEY_ALTERED, f"key:{key.prefix}"))
-        elif _is_back(findings, key):
+        elif key.prefix in findings.ended_keys and key.revoked_at is None:
             problems.append(RecordProblem(KEY_PUT_BACK, f"key:{key.prefix}"))
     return problems
 
@@ -161,13 +155,6 @@ def _tenants(findings: LogFindings, connection: Connection) -> list[RecordProble
         elif findings.settings.get(name, template_enrollment) != template_enrollment:
             problems.append(RecordProblem(TENANT_ALTERED, name))
     return problems
-
-
-def _is_back(findings: LogFindings, key: ApiKey) -> bool:
-    if key.prefix in findings.ended_keys and key.revoked_at is None:
-        return True
-    ends = findings.replaced_keys.get(key.prefix)
-    return ends is not None and (key.expires_at is None or key.expires_at > ends)
 
 
 def _enrollments(

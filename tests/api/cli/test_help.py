@@ -20,7 +20,7 @@ PROMISED = {
         "db current",
     ),
     *("keys create", "keys list", "keys revoke", "keys master", "keys rotate", "keys rewrap"),
-    *("keys verify-receipt", "keys replace", "keys rotate-tenant", "keys renew"),
+    *("keys verify-receipt", "keys rotate-tenant", "keys renew"),
     *("db unlock", "db purge", "db erase-tenant", "db template-enrollment"),
     *("audit-log verify", "audit-log head", "audit-log show"),
     *("audit-log archive", "audit-log verify-archive"),

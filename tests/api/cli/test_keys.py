@@ -50,17 +50,14 @@ def test_a_key_is_made_listed_and_revoked(veilface, store):
     assert "revoked" in veilface("keys", "list").stdout
 
 
-def test_a_lowest_level_is_shown_and_kept_by_a_replacement(veilface, store):
+def test_a_lowest_level_is_shown_and_kept(veilface, store):
     made = veilface("keys", "create", "--right", "verify", "--lowest-level", "fmr-1e-4", "--json")
     assert made.json["lowest_level"] == "fmr-1e-4"
-    replaced = veilface("keys", "replace", made.json["prefix"], "--json")
-    assert replaced.json["lowest_level"] == "fmr-1e-4"
-    assert store.api_keys.verify(replaced.json["token"]).lowest_level == "fmr-1e-4"
+    assert store.api_keys.verify(made.json["token"]).lowest_level == "fmr-1e-4"
     free = veilface("keys", "create", "--right", "verify", "--json")
     listed = {key["prefix"]: key["lowest_level"] for key in veilface("keys", "list", "--json").json}
     assert listed == {
         made.json["prefix"]: "fmr-1e-4",
-        replaced.json["prefix"]: "fmr-1e-4",
         free.json["prefix"]: None,
     }
     shown = veilface("keys", "list").stdout
@@ -84,7 +81,6 @@ def test_the_token_alone_is_on_stdout_or_in_a_private_file(veilface, store, tmp_
     before = veilface("keys", "list", "--json").json
     for out in (file, tmp_path / "absent" / "key"):
         assert veilface(*create, "--out", out).status == 1
-        assert veilface("keys", "replace", kept.json["prefix"], "--out", out).status == 1
     after = veilface("keys", "list", "--json").json
     assert [key["prefix"] for key in after] == [key["prefix"] for key in before]
     assert store.api_keys.verify(file.read_text().strip()) is not None
@@ -174,23 +170,6 @@ def test_a_receipt_is_verified_and_a_changed_one_is_not(store, tmp_path):
     assert ran.status == 1
     assert ran.json["valid"] is False
     assert run("keys", "verify-receipt", receipt, "--public-key", "%%").status == 2
-
-
-def test_a_key_is_replaced_with_time_to_change_over(veilface, store):
-    made = veilface("keys", "create", "--right", "verify", "--label", "shop", "--json").json
-    replaced = veilface("keys", "replace", made["prefix"], "--grace-hours", "2", "--json")
-    assert replaced.status == 0, replaced.stderr
-    assert replaced.json["replaces"] == made["prefix"]
-    assert (replaced.json["rights"], replaced.json["label"]) == (["verify"], "shop")
-    assert store.api_keys.verify(made["token"]) is not None
-    assert store.api_keys.verify(replaced.json["token"]) is not None
-    at_once = veilface("keys", "replace", replaced.json["prefix"], "--grace-hours", "0")
-    assert at_once.status == 0
-    assert store.api_keys.verify(replaced.json["token"]) is None
-    assert store.api_keys.verify(at_once.stdout.strip()) is not None
-    refused = veilface("keys", "replace", "0" * 12)
-    assert refused.status == 1
-    assert "no valid key of this prefix" in refused.stderr
 
 
 def test_a_tenants_rotation_is_renewed_and_nobody_enrolls_again(world, veilface, store):

@@ -98,7 +98,7 @@ def test_it_renews_all_and_says_what_is_left_to_do(used: tuple[Path, dict[str, A
         f"Keep this anchor of the audit log elsewhere: {anchor}",
         "Enroll these subjects of tenant default again, with new photos:\n    ada\n    bob\n",
         "veilface keys rotate-tenant --tenant default --stolen --finish",
-        f"veilface keys replace {key.prefix} --grace-hours 0",
+        f"veilface keys revoke {key.prefix}",
         "1 receipts signed again",
     ):
         assert said in ran.stdout

@@ -8,7 +8,7 @@ import sqlalchemy as sa
 
 from templates.errors import StoreError
 from templates.keys.sealing import MasterKeyring
-from templates.store import By, Right, TemplateStore, UnknownTenant
+from templates.store import Right, TemplateStore, UnknownTenant
 from templates.store.database import Database
 from templates.store.schema import ApiKeyRow
 from tests.templates.store.conftest import Clock
@@ -127,76 +127,13 @@ def test_nonsense_is_refused(store: TemplateStore) -> None:
             store.api_keys.create("default", [Right.VERIFY], label=label)
 
 
-def audit(store: TemplateStore) -> list[tuple[str, str, str | None]]:
-    return [(line.action, line.outcome, line.detail) for line in store.audit_log.lines()]
-
-
-def test_a_replaced_key_works_for_the_grace_only(store: TemplateStore, clock: Clock) -> None:
-    keys = store.api_keys
-    old = keys.create("default", [Right.VERIFY, Right.ENROLL], label="front end")
-    clock.pass_by(days=1)
-    new = keys.replace(old.key.prefix, grace=timedelta(hours=2), by=By("operator:kim"))
-    assert new is not None
-    assert new.token != old.token
-    for name in ("tenant", "rights", "label", "expires_at"):
-        assert getattr(new.key, name) == getattr(old.key, name), name
-    assert new.key.created_at == clock.time
-    assert keys.verify(old.token)
-    assert keys.verify(new.token)
-    clock.pass_by(hours=2)
-    assert keys.verify(old.token) is None
-    assert keys.verify(new.token)
-    assert audit(store) == [
-        ("key-create", "created", old.key.prefix),
-        ("key-create", "created", new.key.prefix),
-        ("key-replace", "replaced", f"{old.key.prefix} {clock.time.isoformat()}"),
-    ]
-    assert [line.actor for line in store.audit_log.lines()][1:] == ["operator:kim"] * 2
-
-
-def test_replacing_does_not_prolong_anything(store: TemplateStore, clock: Clock) -> None:
-    keys = store.api_keys
-    end = clock.time + timedelta(hours=1)
-    for grace in (timedelta(hours=2), timedelta.max):
-        old = keys.create("default", [Right.VERIFY], expires_at=end)
-        new = keys.replace(old.key.prefix, grace=grace)
-        assert new is not None
-        (kept,) = (key for key in keys.all() if key.prefix == old.key.prefix)
-        assert kept.expires_at == new.key.expires_at == end
-    first = keys.create("default", [Right.VERIFY])
-    second = keys.replace(first.key.prefix, grace=timedelta(0))
-    assert second is not None
-    assert keys.verify(first.token) is None
-    assert keys.verify(second.token)
-
-
-def test_only_a_valid_key_is_replaced(store: TemplateStore, clock: Clock) -> None:
-    keys, grace = store.api_keys, timedelta(hours=1)
-    revoked = keys.create("default", [Right.VERIFY])
-    keys.revoke(revoked.key.prefix)
-    expired = keys.create("default", [Right.VERIFY], expires_at=clock.time + timedelta(minutes=1))
-    clock.pass_by(minutes=1)
-    count = len(keys.all())
-    for prefix in (revoked.key.prefix, expired.key.prefix, "nothing"):
-        assert keys.replace(prefix, grace=grace) is None
-    assert len(keys.all()) == count
-    assert not [line for line in audit(store) if line[0] == "key-replace"]
-    with pytest.raises(StoreError, match="nothing or more"):
-        keys.replace(revoked.key.prefix, grace=-grace)
-
-
-def test_a_key_keeps_its_lowest_level_and_so_does_the_one_that_replaces_it(
-    store: TemplateStore,
-) -> None:
+def test_a_key_keeps_its_lowest_level(store: TemplateStore) -> None:
     made = store.api_keys.create("default", [Right.VERIFY], lowest_level="fmr-1e-5")
     assert made.key.lowest_level == "fmr-1e-5"
     assert store.api_keys.create("default", [Right.VERIFY]).key.lowest_level is None
     found = store.api_keys.verify(made.token)
     assert found is not None
     assert found.lowest_level == "fmr-1e-5"
-    new = store.api_keys.replace(made.key.prefix, grace=timedelta(0))
-    assert new is not None
-    assert new.key.lowest_level == "fmr-1e-5"
     with pytest.raises(StoreError, match="name of a level"):
         store.api_keys.create("default", [Right.VERIFY], lowest_level="Not A Level")
 
