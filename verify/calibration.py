@@ -61,7 +61,6 @@ def calibrate(
     source: DecoySource,
     options: CalibrationOptions | None = None,
     exclude: Collection[str] = (),
-    aliases: Mapping[str, str] | None = None,
     labels: PhotoLabels | None = None,
     pairs: Sequence[Pair] | None = None,
     cohort_seed: bytes | None = None,
@@ -81,8 +80,6 @@ def calibrate(
     ----------
     embeddings : (N, n) floating
         Unit rows.
-    aliases
-        Second names of one person, mapped to the first.
     labels
         Of every embedding, for rates by group of people; none without them.
     pairs
@@ -111,7 +108,7 @@ def calibrate(
             f"{len(identities)} identities and a binding of n = {binding.n} need embeddings of "
             f"shape ({len(identities)}, {binding.n}), not {unit.shape}"
         )
-    kept, names = chosen_photos(identities, exclude=exclude, aliases=aliases or {})
+    kept, names = chosen_photos(identities, exclude=exclude)
     if len(set(names)) < 2:
         raise ContractError("a calibration needs at least two people")
     data = np.ascontiguousarray(unit[kept], dtype=np.float32)

@@ -111,8 +111,7 @@ class CalibrationReport:
     ----------
     suspicious
         People who may be one person under two names: look at them before believing a threshold
-        at FMR 1e-4 or below, then name them in ``aliases`` (docs/thresholds.md "One person under
-        two names").
+        at FMR 1e-4 or below (docs/thresholds.md "One person under two names").
     unresolved
         Sentences about the FMR targets that the data cannot resolve.
     left_out

@@ -1,6 +1,6 @@
 """Who is compared with whom in a calibration: enrollments, genuine probes, impostor pairs."""
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -183,16 +183,14 @@ def unit_means(embeddings: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def chosen_photos(
-    identities: Sequence[str], *, exclude: Collection[str], aliases: Mapping[str, str]
+    identities: Sequence[str], *, exclude: Collection[str]
 ) -> tuple[Indices, list[str]]:
-    """Leave out excluded people, and count two names of one person as one.
+    """Leave out excluded people.
 
     Parameters
     ----------
     exclude
         Names to leave out, for instance those that a test uses.
-    aliases
-        Maps a name to the one that the same person is better known by.
 
     Returns
     -------
@@ -201,10 +199,8 @@ def chosen_photos(
     names
         Their people.
     """
-    people = [aliases.get(name, name) for name in identities]
-    gone = {aliases.get(name, name) for name in exclude}
-    photos = [index for index, name in enumerate(people) if name not in gone]
-    return np.asarray(photos, dtype=np.int64), [people[index] for index in photos]
+    photos = [index for index, name in enumerate(identities) if name not in exclude]
+    return np.asarray(photos, dtype=np.int64), [identities[index] for index in photos]
 
 
 def impostor_groups(

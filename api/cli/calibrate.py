@@ -1,6 +1,5 @@
 """``veilface calibrate``: thresholds for stated false match rates."""
 
-import csv
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
@@ -9,10 +8,10 @@ import typer
 
 from api.cli.calibrate_liveness import set_liveness_threshold, with_liveness_of
 from api.cli.calibration import DEFAULT_PROBE_DIM, calibrate_folder, default_probe_dims
-from api.cli.console import demo_notice, share_done
+from api.cli.console import counted, demo_notice, share_done
 from api.cli.descriptors import BULK, Aligned, Cache, Flip, bulk_pack, each_person_once, extract
-from api.cli.errors import CommandError, UsageError
-from api.cli.files import read_bounded, read_names
+from api.cli.errors import UsageError
+from api.cli.files import read_names
 from api.cli.groups import estimated_labels, group_tables, labels_of
 from api.cli.inputs import fairface_labels, listed_numbers, load_decoys
 from api.cli.photo_folders import people_or_faces
@@ -103,12 +102,6 @@ def calibrate(
             "each, or a text file with a name on each line."
         ),
     ] = None,
-    aliases: Annotated[
-        Path | None,
-        typer.Option(
-            help="People under two names: a text file, `second name,first name` on each line."
-        ),
-    ] = None,
     labels: Annotated[
         Path | None,
         typer.Option(
@@ -181,7 +174,6 @@ def calibrate(
     sealer = file_sealer(keyring)
     source = load_decoys(decoys or settings.resolved_decoys_file, sealer, pack)
     exclude = frozenset() if exclude_people is None else read_names(exclude_people)
-    known_as = {} if aliases is None else read_aliases(aliases)
     extraction = extract(pack, labelled.paths, aligned=aligned, settings=settings, cache=cache)
     if labelled.people == len(labelled):
         extraction = each_person_once(extraction)
@@ -208,10 +200,11 @@ def calibrate(
                 seed=seed,
             ),
             exclude=exclude,
-            aliases=known_as,
             labels=groups,
             progress=lambda _what, share: report(share),
         )
+    verdict = done.contract.verdict
+    assert verdict is not None  # noqa: S101 - calibrate_folder judges
     contract = with_liveness_of(path, done.contract, pack, sealer)
     contract.save(path, sealer)
     notice = demo_notice(pack.info.embedder_sha256, n=pack.info.n)
@@ -231,8 +224,9 @@ def calibrate(
             *_report_text(done.contract, done.report),
             f"{acquired(extraction)}.",
             f"{path}: contract {done.contract.contract_id[:16]}.",
-            *improvements(done.contract, done.point),
-            *verdict_lines(done.contract.verdict),
+            f"m = {done.point.dim} of {done.point.axes} axes: {done.point.chosen}.",
+            *improvements(verdict),
+            *verdict_lines(verdict),
         ],
     )
 
@@ -242,23 +236,6 @@ def parse_dims(text: str) -> tuple[int, ...]:
     if text.strip() == "none":
         return ()
     return listed_numbers(text, "--probe-dims", least=1, most=128)
-
-
-def read_aliases(file: Path) -> dict[str, str]:
-    """Read ``second name,first name`` lines; a name with a comma stands in double quotes."""
-    text = read_bounded(file, 16 * 2**20).decode("utf-8", errors="replace")
-    names: dict[str, str] = {}
-    for number, line in enumerate(text.splitlines(), start=1):
-        if not line.strip() or line.startswith("#"):
-            continue
-        parts = [part.strip() for part in next(csv.reader([line], skipinitialspace=True))]
-        if len(parts) != 2 or not all(parts):
-            raise CommandError(
-                f"{file.name}, line {number}: expected `second name,first name`, a name with a "
-                "comma in double quotes"
-            )
-        names[parts[0]] = parts[1]
-    return names
 
 
 def levels_table(calibration: Calibration) -> Table:
@@ -293,7 +270,7 @@ def _report_text(contract: Contract, report: CalibrationReport) -> list[str]:
     return [
         *(f"Not set: {sentence}." for sentence in report.unresolved),
         *(f"Not in the rule of the worst group: {sentence}." for sentence in report.left_out),
-        *suspicious_lines(report, "name the same people in --aliases"),
+        *suspicious_lines(report),
         f"Default level: {contract.default_level}. Photos of one enrollment must agree to "
         f"{contract.photo_consistency:.3f}: {shown_rate(consistency.refused)} of the genuine sets "
         f"do not; {shown_rate(consistency.fmr)} of the pairs of two people do. Photos of one probe "
@@ -301,22 +278,19 @@ def _report_text(contract: Contract, report: CalibrationReport) -> list[str]:
     ]
 
 
-def suspicious_lines(report: CalibrationReport, remedy: str) -> list[str]:
-    """Name the pairs of people who may be one, most alike first, as an alias file takes them."""
-    if not report.suspicious:
+def suspicious_lines(report: CalibrationReport) -> list[str]:
+    """Name the pairs of people who may be one, most alike first."""
+    pairs = report.suspicious
+    if not pairs:
         return []
-    shown, count = report.suspicious[:MOST_SHOWN], len(report.suspicious)
+    more = f"  and {len(pairs) - MOST_SHOWN} more; see --json"
     return [
-        f"{count} {'pair of people is' if count == 1 else 'pairs of people are'} suspiciously "
-        f"alike (cosine above "
-        f"{SUSPICIOUS_ABOVE:g}); look at them, and {remedy}:",
-        *(f"  {_quoted(pair.first)},{_quoted(pair.second)}  {pair.cosine:.3f}" for pair in shown),
-        *([f"  and {count - len(shown)} more; see --json"] if count > len(shown) else []),
+        f"Suspiciously alike, with a cosine above {SUSPICIOUS_ABOVE:g}: "
+        f"{counted(len(pairs), 'pair')} of people; look at them, and put "
+        "the photos of one person into one folder:",
+        *(f"  {pair.first}, {pair.second}: {pair.cosine:.3f}" for pair in pairs[:MOST_SHOWN]),
+        *([more] if len(pairs) > MOST_SHOWN else []),
     ]
-
-
-def _quoted(name: str) -> str:
-    return '"' + name.replace('"', '""') + '"' if "," in name or '"' in name else name
 
 
 def _report_facts(report: CalibrationReport) -> dict[str, Any]:

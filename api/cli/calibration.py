@@ -4,7 +4,7 @@ Axes and dimension are chosen, and privacy is judged, by attacks; so this lies a
 ``verify`` and ``attacks``. The commands ``calibrate`` and ``setup``, and the demo, call it.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -63,7 +63,6 @@ def calibrate_folder(
     m: int | None = None,
     options: CalibrationOptions,
     exclude: Collection[str] = (),
-    aliases: Mapping[str, str] | None = None,
     labels: PhotoLabels | None = None,
     progress: Progress = lambda _what, _share: None,
 ) -> CalibratedFolder:
@@ -102,7 +101,7 @@ def calibrate_folder(
         missing = [failure.path for failure in extraction.failures]
         pairs = read_lfw_pairs(pairs_file, extraction.paths, missing=missing)
     names = [name_of[path] for path in extraction.paths]
-    kept, staying = chosen_photos(names, exclude=exclude, aliases=aliases or {})
+    kept, staying = chosen_photos(names, exclude=exclude)
     if len(kept):
         require_others(source, extraction.embeddings[kept], staying)
     # Thousands of products of small matrices: with a second thread for each, the library spends
@@ -127,7 +126,6 @@ def calibrate_folder(
             source=source,
             options=replace(options, probe_dims=probe_dims),
             exclude=exclude,
-            aliases=aliases,
             labels=labels,
             pairs=pairs,
             recorded=recorded_of(pack),

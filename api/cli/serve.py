@@ -11,13 +11,12 @@ import typer
 from api.cli.console import demo_notice, message, say
 from api.cli.errors import CommandError
 from api.cli.options import STORE, takes_settings
-from api.cli.verdict import private_mode_weakness, verdict_lines
+from api.cli.verdict import verdict_lines
 from api.limits.rates import RateLimits
 from api.service.opening import Deployment, key_beside_database, require_privacy
 from api.service.runtime import Runtime
 from api.service.server import listen, run_server, tls_options
 from api.settings import Settings
-from templates.decoys import DecoyGenerator
 
 FLAGS = (
     *STORE,
@@ -95,9 +94,6 @@ def _opened(settings: Settings, *, check: bool) -> Iterator[Deployment]:
         for line in verdict_lines(contract.verdict):
             message(line)
         require_privacy(contract, settings)
-        browsers_lift = settings.serve_pack and isinstance(deployment.source, DecoyGenerator)
-        if browsers_lift and (weakness := private_mode_weakness(contract)) is not None:
-            message(f"warning: private mode: {weakness}")
         if not deployment.store.api_keys.all():
             message("there is no API key yet: `veilface keys create --out FILE` makes one")
         yield deployment

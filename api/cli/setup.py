@@ -4,10 +4,8 @@ Every step keeps what is there. Embeddings, which take the time, are kept in a s
 the contract is written, so that a run that was stopped goes on.
 """
 
-import os
 import shlex
-import sys
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -23,10 +21,9 @@ from api.cli.errors import CommandError, UsageError
 from api.cli.files import read_bounded
 from api.cli.inputs import load_decoys
 from api.cli.master_keys import is_from_file, opened_store
-from api.cli.options import AsJson, takes_settings
 from api.cli.photo_folders import find_photos, labelled_people
-from api.cli.results import Result, present
-from api.cli.roles import Roles, assign_roles, promises, resolved_rates, too_few, with_several
+from api.cli.results import Result, reports
+from api.cli.roles import Roles, assign_faces, assign_roles, resolved_rates, too_few
 from api.cli.verdict import plain_lines
 from api.http.audit import operator
 from api.service.opening import file_sealer, open_contract, open_keyring
@@ -36,7 +33,7 @@ from models.extraction import Extraction
 from models.pack import ModelPack
 from templates.contract.document import Contract
 from templates.decoys import DecoyGenerator, DecoySource
-from templates.keys.private_file import create_private, replace_private, replace_public
+from templates.keys.private_file import replace_private, replace_public
 from templates.keys.sealing import MasterKeyring
 from templates.space.lifting import Strategy
 from templates.store.api_keys import Right
@@ -51,7 +48,7 @@ RIGHTS = (Right.ENROLL, Right.VERIFY, Right.ERASE, Right.SCORES, Right.ADMIN)
 HEADER = "Written by `veilface setup`; docs/settings.md has the rest."
 
 
-@takes_settings("pack", "providers", "data_dir", "master_key_file")
+@reports("pack", "providers", "data_dir", "master_key_file")
 def setup(
     people: Annotated[
         Path | None,
@@ -81,14 +78,7 @@ def setup(
     ] = None,
     aligned: Aligned = False,
     flip: Flip = False,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Show the plan and what it can promise, and stop.")
-    ] = False,
-    serve: Annotated[
-        bool, typer.Option("--serve", help="Start the service at the end (`veilface serve`).")
-    ] = False,
-    as_json: AsJson = False,
-) -> None:
+) -> Result:
     """Prepare a service from a model pack and folders of photos, and judge it.
 
     With --faces alone nobody has to be labelled. Thresholds then assume that users look like those
@@ -104,63 +94,60 @@ def setup(
     Example: `veilface setup --faces fairface/train --pack buffalo_l`
     """
     pack = bulk_pack(settings, flip=flip, why="a service embeds faces with a model pack")
-    if people is None and like:
-        raise UsageError("--like adapts the decoys to people like those of PEOPLE: give PEOPLE too")
     labelled = None if people is None else _labelled(people)
-    roles = assign_roles(labelled, faces, like or [])
-    if labelled is not None and not resolved_rates(roles.calibration):
-        message(f"note: {too_few(roles.calibration)}: thresholds are set on --faces instead")
+    roles = None if labelled is None else assign_roles(labelled, faces, like or [])
+    if roles is None or not resolved_rates(roles.calibration):
+        if roles is not None:
+            note = too_few(roles.calibration)
+            message(f"note: {note}: thresholds are set on --faces instead")
         if like:
             raise UsageError(
                 "--like adapts the decoys to people like those of PEOPLE, and PEOPLE are too few "
                 "to judge them by: give more PEOPLE, or leave out --like"
             )
-        roles, labelled = assign_roles(None, faces, [], apart=labelled), None
-    plan = _plan(roles, pack, settings, labelled=labelled is not None)
-    nothing = None
+        roles, labelled = assign_faces(faces, labelled), None
     if not resolved_rates(roles.calibration):
-        nothing = f"there is nothing to serve: {too_few(roles.calibration)}; give more --faces"
-    if dry_run or nothing or not as_json:
-        present(Result(plan, _plan_text(plan), error=nothing), json=as_json)
-    if dry_run:
-        return
-    steps: dict[str, str] = {}
+        why = too_few(roles.calibration)
+        raise CommandError(f"there is nothing to serve: {why}; give more --faces")
+    _say_plan(roles, pack)
     if is_from_file(settings):
-        _report(steps, "master key", settings.resolved_master_key_file)
-    else:
-        steps["master key"] = "given"
+        _is_kept("master key", settings.resolved_master_key_file)
     keyring = open_keyring(settings)
     cache = settings.data_dir / "setup.cache"
+    # On whom a contract was judged that is kept, this call's arguments do not say.
+    strangers = labelled is None and not settings.resolved_contract_file.exists()
     contract = _prepared(
-        labelled, roles, pack, keyring, settings, steps,
-        like=like or [], aligned=aligned, cache=cache,
-    )  # fmt: skip
+        labelled, roles, pack, keyring, settings, like=like or [], aligned=aligned, cache=cache
+    )
     cache.unlink(missing_ok=True)
-    _keep_api_key(settings, keyring, steps)
-    error = _write_settings(settings, steps)
-    notice = demo_notice(pack.info.embedder_sha256, n=pack.info.n)
-    facts = {
-        **plan,
-        "steps": steps,
-        "verdict": contract.verdict,
-        **notice,
-    }
-    key_file = api_key_file(settings)
+    key_file = kept_api_key(settings, keyring)
+    error = _write_settings(settings)
     text = [f"API key with the rights {', '.join(sorted(RIGHTS))}: {key_file}"]
     if error is None:
         # Imported here: a server takes long to load.
         from api.cli.serve import service_url
 
-        text += [] if serve else ["Start it: veilface serve"]
-        text += _calls(service_url(settings), key_file)
-    # On whom a contract was judged that is kept, this call's arguments do not say.
-    strangers = labelled is None and steps["contract"] == "made"
-    text += plain_lines(contract.verdict, strangers=strangers)
-    present(Result(facts, text, error=error), json=as_json)
-    if serve:
-        # Anew: this process has run the models, and what accelerators have begun outlives no fork.
-        sys.stdout.flush()
-        os.execv(sys.executable, [sys.executable, "-P", "-m", "veilface", "serve"])  # noqa: S606
+        text += ["Start it: veilface serve", *_calls(service_url(settings), key_file)]
+    return Result(
+        {
+            "labelled": labelled is not None,
+            "people": len(roles.calibration),
+            "photos": roles.photos,
+            "faces": len(roles.faces),
+            "sample": len(roles.sample),
+            "left_out": roles.left_out,
+            "data_dir": settings.data_dir,
+            "master_key_file": settings.resolved_master_key_file
+            if is_from_file(settings)
+            else None,
+            "api_key_file": key_file,
+            "settings_file": config_file(),
+            "verdict": contract.verdict,
+            **demo_notice(pack.info.embedder_sha256, n=pack.info.n),
+        },
+        [*text, *plain_lines(contract.verdict, strangers=strangers)],
+        error=error,
+    )
 
 
 def api_key_file(settings: Settings) -> Path:
@@ -170,65 +157,26 @@ def api_key_file(settings: Settings) -> Path:
 
 def _labelled(people: Path) -> LabelledFolder:
     if people.is_dir() and not any(entry.is_dir() for entry in visible(people)):
-        photos = len(find_photos(people))
         raise CommandError(
-            f"{people} has {photos:,} photos and no folder for a person: nobody is labelled. "
-            "Thresholds are set on people who are told apart, each in a subfolder with two photos "
-            "or more; 80 people with three resolve a false match rate of 1 in 1,000. Unlabelled "
-            "photos serve as --faces, and as --like"
+            f"{people} has {len(find_photos(people)):,} photos and no folder for a person: nobody "
+            "is labelled. Give each person a subfolder with two photos or more; unlabelled photos "
+            "serve as --faces, and as --like"
         )
     return labelled_people(people)
 
 
-def _plan(roles: Roles, pack: ModelPack, settings: Settings, *, labelled: bool) -> dict[str, Any]:
-    info, contract = pack.info, settings.resolved_contract_file
-    can, cannot = promises(roles, n=info.n)
-    return {
-        "pack": {
-            "name": info.name,
-            "n": info.n,
-            "detector": None if info.detector is None else info.detector.kind,
-        },
-        "faces": len(roles.faces),
-        "sample": len(roles.sample),
-        "left_out": roles.left_out,
-        "people": len(roles.calibration),
-        "people_with_several_photos": with_several(roles.calibration),
-        "photos": roles.photos,
-        "decoys_file": settings.resolved_decoys_file,
-        "contract_file": contract,
-        "contract_kept": contract.exists(),
-        "master_key_file": settings.resolved_master_key_file if is_from_file(settings) else None,
-        "api_key_file": api_key_file(settings),
-        "settings_file": config_file() or DEFAULT_CONFIG_FILE,
-        "labelled": labelled,
-        "can": can,
-        "cannot": cannot,
-    }
-
-
-def _plan_text(plan: Mapping[str, Any]) -> list[str]:
-    pack = plan["pack"]
-    detector = pack["detector"] or "none: photos must be aligned crops"
-    adapted = f", adapted to {plan['sample']:,} photos" if plan["sample"] else ""
-    alone = "" if plan["labelled"] else ", each of --faces taken for a person"
-    files = [str(path) for name, path in plan.items() if name.endswith("_file") and path]
-    text = [
-        f"Pack:       {pack['name']}, {pack['n']} numbers per embedding, detector {detector}",
-        f"Decoys:     {plan['faces']:,} faces{adapted}",
-        f"Thresholds: {plan['people']:,} people, {plan['photos']:,} photos{alone}",
-        f"Files:      {', '.join(files)}",
-        *(f"Can be promised:    {sentence}." for sentence in plan["can"]),
-        *(f"Cannot be promised: {sentence}." for sentence in plan["cannot"]),
-    ]
-    if plan["left_out"]:
-        text.append(f"Left out:   {plan['left_out']:,} photos of people who have another role")
-    if plan["contract_kept"]:
-        text.append(
-            f"These are promises of a contract made anew. {plan['contract_file']} is there and "
-            "kept: what it promises is in its own verdict."
-        )
-    return text
+def _say_plan(roles: Roles, pack: ModelPack) -> None:
+    detector = "no detector: photos must be aligned crops"
+    if pack.info.detector is not None:
+        detector = f"detector {pack.info.detector.kind}"
+    adapted = f", adapted to {len(roles.sample):,} photos" if roles.sample else ""
+    aside = f"; {roles.left_out:,} photos of people in another role left out"
+    message(f"... pack: {pack.info.name}, {pack.info.n} numbers per embedding, {detector}")
+    message(
+        f"... roles: decoys of {len(roles.faces):,} faces{adapted}; thresholds on "
+        f"{len(roles.calibration):,} people, {roles.photos:,} photos"
+        f"{aside if roles.left_out else ''}"
+    )
 
 
 def _calls(service: str, key_file: Path) -> list[str]:
@@ -243,10 +191,9 @@ def _calls(service: str, key_file: Path) -> list[str]:
     ]
 
 
-def _report(steps: dict[str, str], step: str, file: Path) -> bool:
+def _is_kept(step: str, file: Path) -> bool:
     """Say whether a step's file is there and kept, which is returned, or is made now."""
     kept = file.exists()
-    steps[step] = "kept" if kept else "made"
     message(f"... {step}: {f'{file} is there and kept' if kept else f'making {file}'}")
     return kept
 
@@ -257,7 +204,6 @@ def _prepared(
     pack: ModelPack,
     keyring: MasterKeyring,
     settings: Settings,
-    steps: dict[str, str],
     *,
     like: Sequence[Path],
     aligned: bool,
@@ -266,9 +212,9 @@ def _prepared(
     """Build the decoys and calibrate, or keep what is there."""
     path, decoys = settings.resolved_contract_file, settings.resolved_decoys_file
     sealer = file_sealer(keyring)
-    decoys_kept = _report(steps, "decoys", decoys)
+    decoys_kept = _is_kept("decoys", decoys)
     source: DecoySource | None = load_decoys(decoys, sealer, pack) if decoys_kept else None
-    if _report(steps, "contract", path):
+    if _is_kept("contract", path):
         contract = open_contract(settings, keyring)
         if source is None:
             raise CommandError(f"{path} has lost its decoys; remove it to make both anew")
@@ -280,25 +226,21 @@ def _prepared(
             "note: the decoys were there: see to it that nobody in PEOPLE is among the photos "
             "that they were made of"
         )
-    names: list[str] = []
-    calibrated_on: list[Path] = []
-    for name, album in roles.calibration.items():
-        names += [name] * len(album)
-        calibrated_on += album
-    photos = calibrated_on if decoys_kept else [*roles.faces, *roles.sample, *calibrated_on]
+    name_of = {path: name for name, album in roles.calibration.items() for path in album}
+    photos = [*name_of] if decoys_kept else [*roles.faces, *roles.sample, *name_of]
     message(f"... embedding {len(photos):,} photos")
     extraction = extract(pack, photos, aligned=aligned, settings=settings, cache=cache)
     message(f"... {acquired(extraction)}, {extraction.cached:,} embedded before")
     if labelled is None:
         extraction = each_person_once(extraction)
-    people = part_of(extraction, calibrated_on)
+    people = part_of(extraction, name_of)
     if source is None:
         folders = like or ([] if labelled is None else [labelled.root])
         source = _fitted(extraction, roles, people, pack, folders=folders)
     root = settings.data_dir if labelled is None else labelled.root
     with share_done("calibrating") as report:
         done = calibrate_folder(
-            LabelledFolder(root, tuple(calibrated_on), tuple(names), ()),
+            LabelledFolder(root, tuple(name_of), tuple(name_of.values()), ()),
             people,
             pack=pack,
             source=source,
@@ -307,7 +249,7 @@ def _prepared(
             progress=lambda _what, share: report(share),
         )
     if labelled is not None:
-        for line in suspicious_lines(done.report, "put the photos of one person into one folder"):
+        for line in suspicious_lines(done.report):
             message(line)
     if isinstance(source, DecoyGenerator) and not decoys_kept:
         source.save(decoys)
@@ -347,29 +289,23 @@ def _fitted(
     return make_generator(faces, pack, like=like_sample(sample, folders) if sample.paths else None)
 
 
-def _keep_api_key(settings: Settings, keyring: MasterKeyring, steps: dict[str, str]) -> None:
-    """See to it that a private file holds a key that the store takes."""
+def kept_api_key(settings: Settings, keyring: MasterKeyring) -> Path:
+    """Return the private file with a key that the store takes; make one where there is none."""
     file = api_key_file(settings)
     with opened_store(settings, keyring) as store:
-        is_there = file.exists()
-        if is_there and store.api_keys.verify(read_token(file)) is not None:
-            _report(steps, "API key", file)
-            return
-        steps["API key"] = "made"
-        why = f"the store does not take the one of {file}: making another" if is_there else ""
-        message(f"... API key: {why or f'making {file}'}")
+        token = read_bounded(file, 4096).decode("ascii", "replace").strip() if file.exists() else ""
+        if store.api_keys.verify(token) is not None:
+            message(f"... API key: {file} is there and kept")
+            return file
+        why = f"the store does not take the one of {file}: making another"
+        message(f"... API key: {why if token else f'making {file}'}")
         store.tenants.create(DEFAULT_TENANT)
         new = store.api_keys.create(DEFAULT_TENANT, RIGHTS, label="setup", by=operator())
-        write = replace_private if is_there else create_private
-        write(file, f"{new.token}\n".encode())
+        replace_private(file, f"{new.token}\n".encode())
+    return file
 
 
-def read_token(file: Path) -> str:
-    """Read the token of an API key from its file."""
-    return read_bounded(file, 4096).decode("ascii", "replace").strip()
-
-
-def _write_settings(settings: Settings, steps: dict[str, str]) -> str | None:
+def _write_settings(settings: Settings) -> str | None:
     """Write the settings file, or keep the one that is there.
 
     Returns
@@ -390,7 +326,7 @@ def _write_settings(settings: Settings, steps: dict[str, str]) -> str | None:
         names.append("providers")
     text = settings_text({name: getattr(settings, name) for name in names}, HEADER)
     file = config_file() or DEFAULT_CONFIG_FILE
-    if not _report(steps, "settings", file):
+    if not _is_kept("settings", file):
         replace_public(file, text.encode())
         return None
     served = load_settings()

@@ -2,8 +2,7 @@
 
 from typing import cast
 
-from attacks.operating_point import ACCURACY_LIMIT, OperatingPoint, rejected_as_advised
-from templates.contract.document import Contract, Rate
+from templates.contract.document import Rate
 from templates.contract.levels import photos_in_words
 from templates.contract.verdict import Judgement, Verdict
 
@@ -73,17 +72,6 @@ def _groups_line(groups: Judgement | None) -> str:
     )
 
 
-LIKE_PHOTOS, LIKE_OPENED = 600, (136, 3_600)
-"""Photos of people like those enrolled, and templates that were opened and attacked where decoys
-had been adapted to so many or more: LFW's people, and people drawn after them, November 2026
-(docs/results/privacy.md)."""
-
-
-STRANGERS_OPENED = "1 person in 7 to 1 in 12"
-"""Of LFW's people, behind decoys of FairFace's faces that were proven on FairFace's people: 8 to
-15 % (docs/privacy.md, November 2026)."""
-
-
 def plain_lines(verdict: Verdict | None, *, strangers: bool = False) -> tuple[str, str]:
     """Say to somebody who knows no biometrics how private and how accurate a contract is.
 
@@ -119,15 +107,13 @@ def _plain_privacy(privacy: Judgement, strangers: bool) -> str:
     if strangers:
         text += (
             " The share is measured on people of --faces. Yours may be of another kind: of LFW's "
-            f"people, behind decoys of FairFace's faces, it was {STRANGERS_OPENED} "
+            "people, behind decoys of FairFace's faces, it was 1 person in 7 to 1 in 12 "
             "(docs/privacy.md, November 2026). Give PEOPLE like yours to measure it for them."
         )
-    errors, trials = LIKE_OPENED
-    if not proven and (privacy.shortfall is not None or opened.value > errors / trials):
+    if not proven:
         text += (
-            f" With {LIKE_PHOTOS} photos or more of people like yours (PEOPLE, --like) the share "
-            f"was about 1 in {trials / errors:.0f} where that was measured: on LFW, on real and "
-            "drawn people, in November 2026 (docs/results/privacy.md)."
+            " It is lower with 600 photos or more of people like yours (PEOPLE, --like); "
+            "docs/results/privacy.md has figures."
         )
     return text
 
@@ -167,62 +153,23 @@ def _one_in(rate: Rate, one: str, several: str) -> str:
     return f"1 {one} in {1 / rate.value:,.0f}"
 
 
-def private_mode_weakness(contract: Contract) -> str | None:
-    """Say that too many single photos are rejected where browsers lift them, or None.
-
-    Browsers lift to the largest dimension that is calibrated; the limit is the one on accuracy.
-    """
-    lifted = [entry for entry in contract.calibrations if entry.mode == "s2s"]
-    calibration = max(lifted, key=lambda entry: entry.probe_m, default=None)
-    levels = () if calibration is None else calibration.levels
-    for level in levels:
-        enrolled, rate = rejected_as_advised(level)
-        if level.name == contract.default_level and rate.value > ACCURACY_LIMIT:
-            return (
-                f"{shown_rate(rate)} of genuine probes of one photo, lifted in the browser, are "
-                f"rejected at {level.name}, with {enrolled or 'any number of'} photos enrolled; "
-                f"the limit is {100 * ACCURACY_LIMIT:.3g} %. Have three photos shown, not one (of "
-                "those the contract has no figure), or build decoys that are like your people "
-                "(`veilface decoys build --like`) and calibrate again"
-            )
-    return None
+_REMEDIES = {
+    "privacy": "To make it private: build the decoys from more photos, of people like these "
+    "(`veilface decoys build … --like PEOPLE`).",
+    "accuracy": "To make it accurate: enroll and verify with more photos; decoys that are more "
+    "like these people allow a smaller dimension.",
+    "groups": "To hold every group of people to the target: calibrate with --worst-group, at "
+    "the price of more false non-matches, on more people of that group.",
+}
 
 
-def improvements(contract: Contract, point: OperatingPoint) -> list[str]:
-    """Say what more photos and more decoys bought, and what would help where a verdict fails."""
-    tried = "; ".join(
-        f"m = {one.m} of {one.axes} axes {100 * one.theft:.2g} %"
-        + ("" if one.rejected is None else f", rejected {100 * one.rejected.value:.3g} %")
-        for one in point.tried
-    )
-    by_photos = ", ".join(
-        f"{100 * level.fnmr.value:.3g} % with {calibration.probe_photos}"
-        for calibration in contract.calibrations
-        if calibration.mode == "p2s"
-        for level in calibration.levels
-        if level.name == contract.default_level and level.fnmr.trials
-    )
-    lines = [f"m = {point.dim} of {point.axes} axes: {point.chosen}."]
-    if by_photos:
-        lines.append(
-            f"False non-matches at {contract.default_level} by photos of a probe: {by_photos}."
-        )
-    if tried:
-        lines.append(f"Templates that a thief is expected to find a match for: {tried}.")
-    remedies = {
-        "privacy": "To make it private: build the decoys from more photos, of people like these "
-        "(`veilface decoys build … --like PEOPLE`).",
-        "accuracy": "To make it accurate: enroll and verify with more photos; decoys that are more "
-        "like these people allow a smaller dimension.",
-        "groups": "To hold every group of people to the target: calibrate with --worst-group, at "
-        "the price of more false non-matches, on more people of that group.",
-    }
-    failed = [
-        name
-        for name in remedies
-        if (judged := getattr(contract.verdict, name, None)) is not None and judged.status == "FAIL"
+def improvements(verdict: Verdict) -> list[str]:
+    """Say what would help where a judgement fails."""
+    return [
+        remedy
+        for name, remedy in _REMEDIES.items()
+        if (judged := getattr(verdict, name)) is not None and judged.status == "FAIL"
     ]
-    return lines + [remedies[name] for name in failed]
 
 
 def _not_acquired(accuracy: Judgement) -> str:

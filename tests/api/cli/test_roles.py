@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from api.cli.roles import Roles, attacked_and_others, promises, resolved_rates, split_people
+from api.cli.roles import is_telling, resolved_rates, split_people
 
 
 def albums(*counts: tuple[int, int]) -> dict[str, list[Path]]:
@@ -15,14 +15,6 @@ def albums(*counts: tuple[int, int]) -> dict[str, list[Path]]:
             name = f"person-{len(named)}"
             named[name] = [Path(name) / f"{photo}.jpg" for photo in range(photos)]
     return named
-
-
-def roles(people: dict[str, list[Path]], *, faces: int, sample: int = 0) -> Roles:
-    return Roles(
-        faces=tuple(Path(f"{face}.jpg") for face in range(faces)),
-        sample=tuple(Path(f"like-{photo}.jpg") for photo in range(sample)),
-        calibration=people,
-    )
 
 
 @pytest.mark.parametrize(
@@ -75,25 +67,11 @@ def test_rates_that_are_resolved(counts: tuple[tuple[int, int], ...], rates: lis
     assert resolved_rates(albums(*counts)) == rates
 
 
-def test_how_many_are_attacked_and_with_how_many_faces() -> None:
-    assert attacked_and_others(albums((200, 5))) == (100, 500)
-    assert attacked_and_others(albums((1_000, 1), (150, 4))) == (200, 950)
-    assert attacked_and_others(albums((10, 1))) == (5, 5)
-
-
-def test_promises_name_what_is_missing() -> None:
-    few = roles(albums((30, 4)), faces=300)
-    can, cannot = promises(few, n=512)
-    assert can == ["thresholds for false match rates of 1 in 100"]
-    said = " ".join(cannot)
-    assert all(part in said for part in ("80 people", "PASS takes 200", "--like", "2,048"))
-
-    many = roles(albums((1_000, 1), (200, 4)), faces=2_048, sample=300)
-    can, cannot = promises(many, n=512)
-    assert cannot == []
-    assert "attacks on 200 people" in " ".join(can)
-    assert "1 in 100, 1 in 1,000, 1 in 10,000" in can[0]
-
-    nobody = roles(albums((10, 1)), faces=2_048, sample=300)
-    can, cannot = promises(nobody, n=512)
-    assert "any false match rate: 10 people are too few" in cannot[0]
+@pytest.mark.parametrize(
+    ("counts", "telling"),
+    [(((200, 5),), False), (((1_000, 1), (150, 4)), False), (((1_000, 1), (200, 4)), True)],
+)
+def test_so_many_people_can_show_that_templates_are_private(
+    counts: tuple[tuple[int, int], ...], telling: bool
+) -> None:
+    assert is_telling(albums(*counts)) == telling

@@ -8,17 +8,12 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 
 import httpx
 import pytest
 
-from api.service.opening import file_sealer
 from models.demo import DEMO_NOTICE
-from templates.contract.document import Contract
-from templates.contract.levels import Rate
-from templates.keys.sealing import MasterKeyring
 from tests.api.cli.conftest import Ran, key_file, run
 from tests.patience import PATIENCE_S
 
@@ -81,31 +76,6 @@ def test_it_serves_prints_no_key_and_ends_by_sigterm(world, data, tmp_path):
     assert "API key" not in again.stderr
     assert not warnings(again)
     assert "Privacy:  NOT SHOWN. The strongest thief, with" in again.stderr
-
-
-@pytest.mark.parametrize(("rejected", "warned"), [(2, False), (3, True)])
-def test_the_check_warns_where_browsers_lift_and_too_many_are_rejected(
-    world, data, rejected, warned
-):
-    """Of 100 lifted probes with three photos enrolled; of one and of five, all."""
-    sealer = file_sealer(MasterKeyring.load(key_file(data)))
-    contract = Contract.load(data / "contract.json", sealer)
-    photos, lifted = contract.calibrations
-    some, every = Rate(rejected, 100, 0.01, 0.05), Rate(100, 100, 0.9, 1.0)
-    levels = tuple(
-        replace(level, fnmr=every, fnmr_by_photos={1: every, 3: some, 5: every})
-        for level in lifted.levels
-    )
-    lifted = replace(lifted, levels=levels, calibration_id="")
-    replace(contract, calibrations=(photos, lifted)).save(data / "contract.json", sealer)
-    check = ("serve", "--check", "--data-dir", data, "--pack", world.pack)
-    said = warnings(run(*check, "--serve-pack"))
-    assert len(said) == warned
-    for line in said:
-        assert line.startswith("warning: private mode: 3 % (3/100; 1-5 %) of genuine probes of one")
-        assert f"at {contract.default_level}, with 3 photos enrolled; the limit is 2 %" in line
-        assert "veilface decoys build --like" in line
-    assert not warnings(run(*check))
 
 
 def test_a_master_key_beside_the_database_is_used_with_a_warning(world, data):
