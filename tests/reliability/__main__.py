@@ -6,17 +6,10 @@ import sys
 import tempfile
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
 
 from tests.reliability.cluster import Cluster
 from tests.reliability.evidence import Report
-from tests.reliability.full_disk import (
-    FileSizeLimit,
-    FullFileSystem,
-    full_disk_run,
-    may_mount,
-    small_file_system,
-)
+from tests.reliability.full_disk import full_disk_run
 from tests.reliability.kill import kill_run
 from tests.reliability.outage import outage_run
 from tests.reliability.races import CLIENTS, lockout_run, race_run
@@ -32,11 +25,7 @@ def run(arguments: argparse.Namespace, folder: Path, resources: ExitStack) -> Re
         cluster, modes = resources.enter_context(Cluster()), ("fast", "immediate") * 5
         return outage_run(cluster, folder, modes=modes, down_s=5.0, seed=seed)
     if arguments.scenario == "full-disk":
-        rounds: dict[str, Any] = {"rounds": 5, "short_s": 4.0, "seed": seed}
-        if not may_mount():
-            return full_disk_run(FileSizeLimit(), folder / "veilface.db", folder, **rounds)
-        small = resources.enter_context(small_file_system())
-        return full_disk_run(FullFileSystem(small), small / "veilface.db", folder, **rounds)
+        return full_disk_run(folder, rounds=5, short_s=4.0, seed=seed)
     postgres = arguments.database == "postgres"
     url = resources.enter_context(Cluster()).url if postgres else None
     if arguments.scenario == "races":

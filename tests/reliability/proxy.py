@@ -1,7 +1,6 @@
-"""nginx before two hosts, as docs/deploy.md has it."""
+"""nginx, set up by a block of the pages."""
 
 import os
-import re
 import shutil
 import subprocess
 from collections.abc import Iterator
@@ -44,21 +43,6 @@ def write_configuration(block: str, folder: Path, listen: str) -> Path:
         f"http {{\naccess_log off;\n{kept}{block}}}\n"
     )
     return path
-
-
-@contextmanager
-def nginx(folder: Path, address: str, hosts: list[str], port: int) -> Iterator[str]:
-    """Run nginx at an address, before hosts that serve on a port; gives its URL."""
-    (upstream,) = re.findall(r"```nginx\n(upstream .*?)```", PAGE, re.S)
-    (block,) = re.findall(r"```nginx\n(limit_conn_zone .*?)```", PAGE, re.S)
-    assert block.count("http://127.0.0.1:8421;") == 1
-    block = upstream + block.replace("http://127.0.0.1:8421;", "http://veilface;")
-    for number, host in enumerate(hosts):
-        written = f"10.0.0.{11 + number}:8421"
-        assert written in block
-        block = block.replace(written, f"{host}:{port}")
-    with running_nginx(block, folder, address) as url:
-        yield url
 
 
 @contextmanager
