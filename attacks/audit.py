@@ -212,8 +212,8 @@ def _calibrated(
     population: Population, binding: Binding, source: DecoySource, plan: AuditPlan
 ) -> Contract:
     """Calibrate as a service does, with a cohort of a seed: audits give the same figures twice."""
-    with Keystream.seeded("audit", plan.seed, binding.strategy, binding.m, "cohort") as stream:
-        cohort_seed = stream.token(KEY_BYTES)
+    stream = Keystream.seeded("audit", plan.seed, binding.strategy, binding.m, "cohort")
+    cohort_seed = stream.token(KEY_BYTES)
     dims = tuple(min(dim, binding.m) for dim in plan.calibration.probe_dims)
     return calibrate(
         population.others,

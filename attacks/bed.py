@@ -189,14 +189,14 @@ class Testbed:
         Strategies that need labels or sub-databases are lifted in their plain form.
         """
         m = m or self.m
-        with Keystream.seeded("privacy", self.seed, self.source.k, m, *purpose) as stream:
-            lifted = lift(
-                points,
-                strategy=plain_strategy(self.strategy),
-                m=m,
-                source=self.source,
-                stream=stream,
-            )
+        stream = Keystream.seeded("privacy", self.seed, self.source.k, m, *purpose)
+        lifted = lift(
+            points,
+            strategy=plain_strategy(self.strategy),
+            m=m,
+            source=self.source,
+            stream=stream,
+        )
         if self.contract is None:
             return as_stored(lifted)
         return through_wire(lifted, contract_id=self.contract.contract_id)

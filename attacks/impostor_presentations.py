@@ -47,9 +47,9 @@ def verify_presentations(
     contract.binding.require_embedder(
         embedder_sha256=info.embedder_sha256, preprocessing=info.preprocessing, n=info.n
     )
-    with Keystream.seeded("impostor presentations", seed) as stream:
-        rotation = TenantRotation(stream.token(KEY_BYTES), source.k)
-        lift_secret = stream.token(KEY_BYTES)
+    stream = Keystream.seeded("impostor presentations", seed)
+    rotation = TenantRotation(stream.token(KEY_BYTES), source.k)
+    lift_secret = stream.token(KEY_BYTES)
     enroller = Enroller(contract, source, rotation=rotation, lift_secret=lift_secret)
     verifier = Verifier(contract, source, rotation=rotation)
     name = level or contract.default_level

@@ -307,8 +307,8 @@ def _rejected(setup: AttackSetup, strategy: Strategy, axes: int, m: int) -> Rate
     source = setup.source.reduced(axes)
     pairs = people.along(source)
     plain = plain_strategy(strategy)
-    with Keystream.seeded("price", setup.seed, axes, m) as stream:
-        templates = lift(pairs.enrolled, strategy=plain, m=m, source=source, stream=stream)
+    stream = Keystream.seeded("price", setup.seed, axes, m)
+    templates = lift(pairs.enrolled, strategy=plain, m=m, source=source, stream=stream)
     nobody = Nobody(client_source(source), plain, m, bytes(KEY_BYTES))
     means, spreads = nobody.statistics(pairs.fresh, Metric.SPHERICAL)
     close = similarity(pairwise_distances(pairs.fresh, templates, metric=Metric.SPHERICAL))

@@ -19,15 +19,15 @@ def rotations_of(
     bed: Testbed, tenant: str, templates: str, count: int
 ) -> list[SignedCosineRotation]:
     """Return the rotations of some templates of a tenant of the experiment, one for each."""
-    with Keystream.seeded("audit", bed.seed, "tenant key", tenant) as stream:
-        rotation = TenantRotation(stream.token(KEY_BYTES), bed.source.k)
+    stream = Keystream.seeded("audit", bed.seed, "tenant key", tenant)
+    rotation = TenantRotation(stream.token(KEY_BYTES), bed.source.k)
     return [rotation.of(f"{templates} {number}") for number in range(count)]
 
 
 def holder_rotations_of(bed: Testbed, enrollment: str, count: int) -> list[SignedCosineRotation]:
     """Return the rotations of an enrollment of some people, each under a key of their own."""
-    with Keystream.seeded("audit", bed.seed, "holder keys") as stream:
-        keys = [stream.token(KEY_BYTES) for _ in range(count)]
+    stream = Keystream.seeded("audit", bed.seed, "holder keys")
+    keys = [stream.token(KEY_BYTES) for _ in range(count)]
     return [
         holder_rotation(key, f"{enrollment} {number}", bed.source.k)
         for number, key in enumerate(keys)

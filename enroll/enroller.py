@@ -219,20 +219,20 @@ class Enroller:
         contract, binding = self._contract, self._contract.binding
         descriptor = mean_embedding(rows, consistency=contract.photo_consistency)
         named = [attributes or Attributes()] if binding.strategy is Strategy.HYBRID_PLUS else None
-        with lift_stream(
+        stream = lift_stream(
             self._lift_secret,
             contract_id=contract.contract_id,
             photos=photos,
             holder=None if holder is None else (holder.tenant, holder.subject),
-        ) as stream:
-            lifted = lift(
-                self._source.project(descriptor[None]),
-                strategy=binding.strategy,
-                m=binding.m,
-                source=self._source,
-                stream=stream,
-                attributes=named,
-            )
+        )
+        lifted = lift(
+            self._source.project(descriptor[None]),
+            strategy=binding.strategy,
+            m=binding.m,
+            source=self._source,
+            stream=stream,
+            attributes=named,
+        )
         return self._enrollment(
             *self._turned_by_holder(lifted[0], holder),
             per_photo=tuple(results),
@@ -303,8 +303,8 @@ class Enroller:
     def _spanned_anew(self, subspace: SubspaceBatch, holder_salt: str | None) -> Enrollment:
         # The client knows its rows. Turned as they are, they would be pairs (x, R x) of the
         # template's rotation for whoever sees them stored; of a fresh basis only the set is known.
-        with Keystream.fresh() as stream:
-            spanned = SubspaceBatch.through(subspace.foot, subspace.basis, stream=stream)
+        stream = Keystream.fresh()
+        spanned = SubspaceBatch.through(subspace.foot, subspace.basis, stream=stream)
         return self._enrollment(spanned, holder_salt)
 
     def _turned_by_holder(

@@ -142,12 +142,12 @@ class PublicContract:
             The embeddings are not of one person.
         """
         mean = mean_embedding(embeddings, consistency=self.consistency(probe=probe))
-        with Keystream.fresh() as stream:
-            batch = lift(
-                decoys.project(mean[None]),
-                strategy=self.binding.strategy,
-                m=m,
-                source=decoys,
-                stream=stream,
-            )
+        stream = Keystream.fresh()
+        batch = lift(
+            decoys.project(mean[None]),
+            strategy=self.binding.strategy,
+            m=m,
+            source=decoys,
+            stream=stream,
+        )
         return wire.encode(batch[0], contract_id=self.contract_id)

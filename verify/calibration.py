@@ -134,15 +134,15 @@ def calibrate(
     service = Lifter(binding.strategy, source, binding.contract_id)
     generator = client_source(source)
     progress("enrolling people", 0.0)
-    with Keystream.seeded("calibration templates", options.seed) as stream:
-        templates = service.lift(
-            enrolled_means(data, plan)[plan.compared],
-            m=binding.m,
-            stream=stream,
-        )
+    stream = Keystream.seeded("calibration templates", options.seed)
+    templates = service.lift(
+        enrolled_means(data, plan)[plan.compared],
+        m=binding.m,
+        stream=stream,
+    )
     if cohort_seed is None:
-        with Keystream.fresh() as stream:
-            cohort_seed = stream.token(KEY_BYTES)
+        stream = Keystream.fresh()
+        cohort_seed = stream.token(KEY_BYTES)
     run = CalibrationRun(
         embeddings=data,
         plan=plan,

@@ -182,22 +182,22 @@ def calibrate_points(run: CalibrationRun, sets: ProbeSets) -> Calibration:
 def calibrate_lifted(run: CalibrationRun, probe_m: int, rng: np.random.Generator) -> Calibration:
     """Calibrate lifted probes of one dimension."""
     options = run.options
-    with Keystream.seeded("calibration probes", options.seed, probe_m) as stream:
-        trials = lifted_trials(
-            run.embeddings,
-            run.plan,
-            run.templates,
-            run.nobody.cohort,
-            run.client,
-            probe_m=probe_m,
-            metric=options.metric,
-            steps=options.steps,
-            most_probes=options.lifted_probes,
-            impostor_pairs=options.lifted_impostor_pairs,
-            rng=rng,
-            stream=stream,
-            progress=run.progress,
-        )
+    stream = Keystream.seeded("calibration probes", options.seed, probe_m)
+    trials = lifted_trials(
+        run.embeddings,
+        run.plan,
+        run.templates,
+        run.nobody.cohort,
+        run.client,
+        probe_m=probe_m,
+        metric=options.metric,
+        steps=options.steps,
+        most_probes=options.lifted_probes,
+        impostor_pairs=options.lifted_impostor_pairs,
+        rng=rng,
+        stream=stream,
+        progress=run.progress,
+    )
     return _calibration(
         run,
         trials.impostors,
@@ -302,12 +302,12 @@ def _ten_fold(run: CalibrationRun, probe_m: int) -> TenFold:
     enrolled, numbers = np.unique(firsts, return_inverse=True)
     probing, positions = np.unique(seconds, return_inverse=True)
     options = run.options
-    with Keystream.seeded("ten folds", options.seed, probe_m) as stream:
-        templates = run.service.lift(run.embeddings[enrolled], m=run.templates.m, stream=stream)
-        raw = run.embeddings[probing]
-        probes: Probes = run.nobody.generator.project(raw)
-        if probe_m:
-            probes = run.client.lift(raw, m=probe_m, stream=stream)
+    stream = Keystream.seeded("ten folds", options.seed, probe_m)
+    templates = run.service.lift(run.embeddings[enrolled], m=run.templates.m, stream=stream)
+    raw = run.embeddings[probing]
+    probes: Probes = run.nobody.generator.project(raw)
+    if probe_m:
+        probes = run.client.lift(raw, m=probe_m, stream=stream)
     close = pair_similarities(
         probes,
         templates,

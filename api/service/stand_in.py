@@ -26,8 +26,8 @@ class SealedStandIn:
     """
 
     def __init__(self, nobody: Nobody, keyring: MasterKeyring, *, contract_id: str) -> None:
-        with Keystream(secrets.token_bytes(32)) as stream:
-            lifted = nobody.lift(stream)
+        stream = Keystream(secrets.token_bytes(32))
+        lifted = nobody.lift(stream)
         self._wire = wire.encode(lifted, contract_id=contract_id, dtype=WIRE_DTYPE)
         self._keyring = keyring
         self._owner = Owner("", "stand-in", "", contract_id, "", 0)

@@ -123,8 +123,8 @@ class OwnTemplates:
         """
         faces = np.random.default_rng(bed.seed).permutation(bed.gallery)[: 2 * TARGETS]
         half = len(faces) // 2
-        with Keystream.seeded("audit", bed.seed, str(bed.scheme), "attacker's cohort") as stream:
-            seed = stream.token(KEY_BYTES)
+        stream = Keystream.seeded("audit", bed.seed, str(bed.scheme), "attacker's cohort")
+        seed = stream.token(KEY_BYTES)
         generator = client_source(bed.source)
         return cls(
             targets=bed.lift(faces[:half], "attacker's targets"),

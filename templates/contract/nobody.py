@@ -144,8 +144,8 @@ class Nobody:
 
     @cached_property
     def _cohort(self) -> SubspaceBatch:
-        with Keystream(self.cohort_seed) as stream:
-            return self._lift(COHORT_SIZE, stream)
+        stream = Keystream(self.cohort_seed)
+        return self._lift(COHORT_SIZE, stream)
 
     def _lift(self, count: int, stream: Keystream) -> SubspaceBatch:
         points = self.generator.draw(count, 1, stream=stream)[:, 0]

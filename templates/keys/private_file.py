@@ -8,7 +8,6 @@ import errno
 import os
 import secrets
 import stat
-from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO
 
@@ -28,56 +27,27 @@ def replace_private(path: Path, data: bytes) -> None:
     OSError
         The file cannot be written, or is another user's. Nothing is left beside the target.
     """
-    target = Path(os.path.realpath(path))
-    _write(path, target, data, mode=0o600, place=lambda draft: draft.replace(target))
+    _write(path, Path(os.path.realpath(path)), data, mode=0o600, new=False)
 
 
 def replace_public(path: Path, data: bytes) -> None:
     """Replace a file as :func:`replace_private` does; the umask says who may read it."""
-    target = Path(os.path.realpath(path))
-    _write(path, target, data, mode=0o666, place=lambda draft: draft.replace(target))
+    _write(path, Path(os.path.realpath(path)), data, mode=0o666, new=False)
 
 
 def create_private(path: Path, data: bytes) -> None:
-    """Write a new file of mode 0600.
-
-    Raises
-    ------
-    FileExistsError
-        There is a file, or a link, already.
-    OSError
-        The file cannot be written.
-    """
-
-    def place(draft: Path) -> None:
-        path.hardlink_to(draft)
-        draft.unlink()
-
-    _write(path, path.parent.resolve() / path.name, data, mode=0o600, place=place)
+    """Write a new file of mode 0600; ``FileExistsError`` where there is a file or a link."""
+    _write(path, path.parent.resolve() / path.name, data, mode=0o600, new=True)
 
 
 def refuse_another_users(path: Path) -> None:
-    """Refuse to work as root on a file, a link or in a folder that another user owns.
-
-    Raises
-    ------
-    PermissionError
-        It names the user to run this as.
-    """
-    if os.geteuid() != 0:
-        return
-    existing = next(place for place in (path, *path.parents) if os.path.lexists(place))
-    owner = existing.lstat().st_uid
-    if owner != 0:
-        import pwd  # not on Windows, where clients import what imports this
-
-        try:
-            name = f"{pwd.getpwuid(owner).pw_name} ({owner})"
-        except KeyError:
-            name = str(owner)
-        raise PermissionError(
-            errno.EPERM, f"{existing} belongs to user {name}: run this as that user"
-        )
+    """Refuse to work as root on a file, a link or in a folder of another user's, who is named."""
+    if os.geteuid() == 0:
+        existing = next(place for place in (path, *path.parents) if os.path.lexists(place))
+        if owner := existing.lstat().st_uid:
+            raise PermissionError(
+                errno.EPERM, f"{existing} belongs to user {owner}: run this as that user"
+            )
 
 
 def read_at_most(file: BinaryIO, most: int) -> bytes:
@@ -85,24 +55,12 @@ def read_at_most(file: BinaryIO, most: int) -> bytes:
 
     ``file.read(most + 1)`` asks for all that memory even where the file is small: a limit of
     gigabytes then fails under a limit of the process's address space.
-
-    Returns
-    -------
-    bytes
-        More than ``most`` bytes, by one, where the file is larger than that.
-
-    Raises
-    ------
-    OSError
-        The file cannot be read.
     """
     data = file.read(min(os.fstat(file.fileno()).st_size, most) + 1)
-    pieces, size = [data], len(data)
     # A pipe states no size, and a file may grow while it is read.
-    while size <= most and (piece := file.read(min(_PIECE, most + 1 - size))):
-        pieces.append(piece)
-        size += len(piece)
-    return data if len(pieces) == 1 else b"".join(pieces)
+    while len(data) <= most and (piece := file.read(min(_PIECE, most + 1 - len(data)))):
+        data += piece
+    return data
 
 
 def read_private(path: Path, most: int, *, source: str, remedy: str, allowed: int = 0) -> bytes:
@@ -140,9 +98,7 @@ def read_private(path: Path, most: int, *, source: str, remedy: str, allowed: in
     return data
 
 
-def _write(
-    path: Path, target: Path, data: bytes, *, mode: int, place: Callable[[Path], object]
-) -> None:
+def _write(path: Path, target: Path, data: bytes, *, mode: int, new: bool) -> None:
     """Write a draft beside the target, flush it, and put it in its place."""
     try:
         if target.exists() and not target.is_file():
@@ -158,10 +114,12 @@ def _write(
                 file.write(data)
                 file.flush()
                 os.fsync(descriptor)
-            place(draft)
-        except BaseException:
-            draft.unlink()
-            raise
+            if new:
+                path.hardlink_to(draft)
+            else:
+                draft.replace(target)
+        finally:
+            draft.unlink(missing_ok=True)
         folder = os.open(target.parent, os.O_RDONLY | os.O_CLOEXEC)
         try:
             os.fsync(folder)

@@ -7,11 +7,9 @@ be able to predict the randomness of the next one, as they could with PCG64 or t
 import hashlib
 import json
 import os
-from types import TracebackType
 from typing import Self
 
 import numpy as np
-from cryptography.exceptions import AlreadyFinalized
 from cryptography.hazmat.primitives.ciphers import Cipher
 from cryptography.hazmat.primitives.ciphers.algorithms import ChaCha20
 from numpy.typing import NDArray
@@ -52,14 +50,12 @@ _FAR_TAIL = (
 class Keystream:
     """ChaCha20 keystream turned into samples; the only source of randomness of ``templates``.
 
-    In production every template gets a stream of its own from :meth:`fresh`, whose cipher is
-    dropped when the template is made (use it as a context manager). Experiments share one
-    :meth:`seeded` stream.
+    Every template gets a stream of its own, from :meth:`fresh` or from a secret; experiments share
+    one :meth:`seeded` stream.
 
     Examples
     --------
-    >>> with Keystream.seeded("example", 1) as stream:
-    ...     stream.choose(5, rows=1, k=2).shape
+    >>> Keystream.seeded("example", 1).choose(5, rows=1, k=2).shape
     (1, 2)
     """
 
@@ -92,44 +88,16 @@ class Keystream:
     def __repr__(self) -> str:
         return "Keystream()"
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.destroy()
-
     def __reduce__(self) -> str | tuple[object, ...]:
         raise TypeError("a keystream is not copied or stored: two copies would repeat each other")
 
-    def destroy(self) -> None:
-        """Drop the cipher; later draws raise ``ValueError``.
-
-        OpenSSL overwrites its state when it frees it. The key that the operating system gave is
-        an immutable object of Python: it is released, but cannot be overwritten.
-        """
-        try:
-            self._cipher.finalize()
-        except AlreadyFinalized:
-            return
-
     def token(self, nbytes: int) -> bytes:
         """Return ``nbytes`` bytes of the stream."""
-        try:
-            return self._cipher.update(bytes(nbytes))
-        except AlreadyFinalized:
-            raise ValueError("this keystream was destroyed: make a fresh one") from None
+        return self._cipher.update(bytes(nbytes))
 
     def _words(self, out: NDArray[np.uint64]) -> NDArray[np.uint64]:
         """Fill a contiguous array of at most ``_TILE`` words."""
-        try:
-            self._cipher.update_into(memoryview(_ZEROS)[: out.nbytes], out.view(np.uint8).data)
-        except AlreadyFinalized:
-            raise ValueError("this keystream was destroyed: make a fresh one") from None
+        self._cipher.update_into(memoryview(_ZEROS)[: out.nbytes], out.view(np.uint8).data)
         return out
 
     def uniform(self, shape: Shape, low: float = 0.0, high: float = 1.0) -> NDArray[np.float64]:

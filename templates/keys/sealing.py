@@ -27,7 +27,6 @@ from templates.keys.key_file import (
     KEY_BYTES,
     Stamp,
     check_keys,
-    check_place,
     keys_in,
     read_key_file,
     stamp_of,
@@ -40,7 +39,7 @@ TAG_BYTES = 16
 OVERHEAD_BYTES = 1 + KEY_ID_BYTES + NONCE_BYTES + TAG_BYTES
 
 _VERSION = 1
-_MAX_PLAINTEXT_BYTES = 2**31 - 1 - OVERHEAD_BYTES  # the limit of one call of the AES-GCM library
+_FILE_PURPOSE = "sealer/file"
 
 
 class Sealer(Protocol):
@@ -138,7 +137,6 @@ class MasterKeyring:
             If the file exists already or cannot be written.
         """
         path = Path(path)
-        check_place(path)
         write_key_file(path, [os.urandom(KEY_BYTES)], replace=False)
         return cls.load(path)
 
@@ -167,11 +165,6 @@ class MasterKeyring:
 
         The file is replaced in one step. Afterwards wrap the store again, then
         :meth:`drop_retired`. Call both inside a write of the store: it keeps other rotations out.
-
-        Raises
-        ------
-        SealError
-            If the file cannot be used or replaced.
         """
         path = Path(path)
         keys, _ = read_key_file(path)
@@ -184,21 +177,9 @@ class MasterKeyring:
         """Keep only the first key of a key file; returns how many were dropped.
 
         Whatever is still sealed under a dropped key is lost: ask
-        ``TemplateStore.wrapped_keys.count()`` first.
-
-        Parameters
-        ----------
-        path
-            The key file.
-        keep
-            Id of the key that everything was found to be sealed under. It must still be the
-            first one.
-
-        Raises
-        ------
-        SealError
-            If another key is the first one by now, or the file cannot be used or replaced. Then
-            no key is dropped.
+        ``TemplateStore.wrapped_keys.count()`` first. `keep` is the id of the key that everything
+        was found to be sealed under; where another one is the first by now, or the file cannot be
+        replaced, a :class:`SealError` says so and no key is dropped.
         """
         path = Path(path)
         keys, _ = read_key_file(path)
@@ -241,14 +222,12 @@ class MasterKeyring:
         Parameters
         ----------
         plaintext
-            At most 2 GiB.
+            Less than 2 GiB.
         purpose
             Label of the derived key, for instance ``"subject-key"``.
         bound_to
             What the blob belongs to; it opens only with the same parts.
         """
-        if len(plaintext) > _MAX_PLAINTEXT_BYTES:
-            raise SealError(f"{len(plaintext)} bytes are too many to seal at once (2 GiB at most)")
         self._follow_file()
         keys = self._keys
         header = bytes([_VERSION]) + keys.ids[0]
@@ -320,30 +299,21 @@ class MasterKeyring:
 
 
 class KeyringSealer:
-    """A :class:`Sealer` under a master keyring, for files: decoy pools, contracts, caches.
+    """A :class:`Sealer` under a master keyring, for files: decoy pools, contracts, caches."""
 
-    Parameters
-    ----------
-    keyring
-        The master keys.
-    purpose
-        Label of the derived key. Readers and writers of one file must agree on it.
-    """
-
-    def __init__(self, keyring: MasterKeyring, *, purpose: str = "file") -> None:
+    def __init__(self, keyring: MasterKeyring) -> None:
         self._keyring = keyring
-        self._purpose = f"sealer/{purpose}"
 
     def seal(self, plaintext: bytes, *, context: str) -> bytes:
         """Encrypt `plaintext`, bound to `context`."""
-        return self._keyring.seal(plaintext, purpose=self._purpose, bound_to=[context])
+        return self._keyring.seal(plaintext, purpose=_FILE_PURPOSE, bound_to=[context])
 
     def open(self, sealed: bytes, *, context: str) -> bytes:
         """Decrypt; :class:`SealError` for another key or context, or an altered byte."""
-        return self._keyring.open(sealed, purpose=self._purpose, bound_to=[context])
+        return self._keyring.open(sealed, purpose=_FILE_PURPOSE, bound_to=[context])
 
     def __repr__(self) -> str:
-        return f"KeyringSealer({self._keyring!r}, purpose={self._purpose!r})"
+        return f"KeyringSealer({self._keyring!r})"
 
 
 def sealed_key_id(sealed: bytes) -> str:

@@ -132,8 +132,8 @@ def lift(
     source : DecoySource, optional
         Required by every strategy but random.
     stream : Keystream, optional
-        Of :func:`lift_stream` for what is stored; a seeded one in experiments. By default every
-        template gets a fresh key, dropped afterwards.
+        Of :func:`lift_stream` for what is stored; a seeded one in experiments. A fresh one by
+        default.
     attributes : sequence of Attributes, optional
         One per descriptor; required by hybrid+ and refused by the others.
 
@@ -153,16 +153,17 @@ def lift(
     """
     points = unit_descriptors(descriptors)
     strategy = _check(points, strategy, m, source, attributes)
-    if stream is not None:
-        return _lift(points, strategy, m, source, stream, attributes)
-    feet = np.empty(points.shape, dtype=np.float32)
-    bases = np.empty((len(points), m, points.shape[1]), dtype=np.float32)
-    for row in range(len(points)):
-        one = slice(row, row + 1)
-        with Keystream.fresh() as fresh:
-            chosen = None if attributes is None else attributes[row : row + 1]
-            template = _lift(points[one], strategy, m, source, fresh, chosen)
-        feet[one], bases[one] = template.feet, template.bases
+    count, n = points.shape
+    stream = stream or Keystream.fresh()
+    feet = np.empty((count, n), dtype=np.float32)
+    bases = np.empty((count, m, n), dtype=np.float32)
+    step = max(1, _TILE_BYTES // (8 * m * n))
+    for first in range(0, count, step):
+        tile = slice(first, min(first + step, count))
+        chosen = None if attributes is None else attributes[tile]
+        directions = _directions(points[tile], strategy, m, source, stream, chosen)
+        batch = SubspaceBatch.through(points[tile], directions, stream=stream)
+        feet[tile], bases[tile] = batch.feet, batch.bases
     return SubspaceBatch(feet, bases)
 
 
@@ -195,27 +196,6 @@ def _check(
     elif attributes is not None:
         raise LiftingError(f"{strategy} lifting does not use attributes: leave them out")
     return strategy
-
-
-def _lift(
-    points: NDArray[np.float64],
-    strategy: Strategy,
-    m: int,
-    source: DecoySource | None,
-    stream: Keystream,
-    attributes: Sequence[Attributes] | None,
-) -> SubspaceBatch:
-    count, n = points.shape
-    feet = np.empty((count, n), dtype=np.float32)
-    bases = np.empty((count, m, n), dtype=np.float32)
-    step = max(1, _TILE_BYTES // (8 * m * n))
-    for first in range(0, count, step):
-        tile = slice(first, min(first + step, count))
-        chosen = None if attributes is None else attributes[tile]
-        directions = _directions(points[tile], strategy, m, source, stream, chosen)
-        batch = SubspaceBatch.through(points[tile], directions, stream=stream)
-        feet[tile], bases[tile] = batch.feet, batch.bases
-    return SubspaceBatch(feet, bases)
 
 
 def _directions(

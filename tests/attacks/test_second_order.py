@@ -29,8 +29,8 @@ def templates_of(
     others = unit(rng.normal(size=(count, k, N)) * decoys)
     noise = rng.uniform(-1, 1, size=(count, random, N))
     directions = np.concatenate([others - people[:, None], noise], axis=1)
-    with Keystream.seeded("second order") as stream:
-        return SubspaceBatch.through(people, directions, stream=stream), people
+    stream = Keystream.seeded("second order")
+    return SubspaceBatch.through(people, directions, stream=stream), people
 
 
 def exact(deviations: np.ndarray) -> Moments:
@@ -120,8 +120,8 @@ def test_the_moment_of_normalised_draws_is_that_of_many_draws() -> None:
 @pytest.mark.parametrize("source", [make_generator(), make_pool()])
 def test_the_moment_of_decoys_is_that_of_what_is_drawn(source: object) -> None:
     generator = getattr(source, "fitted", source)
-    with Keystream.seeded("moment of decoys") as stream:
-        drawn = generator.draw(1, 60_000, stream=stream)[0]
+    stream = Keystream.seeded("moment of decoys")
+    drawn = generator.draw(1, 60_000, stream=stream)[0]
     np.testing.assert_allclose(decoy_moment(source), second_moment(drawn), atol=2e-3)
 
 

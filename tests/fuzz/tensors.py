@@ -40,11 +40,11 @@ def repeatable(rng: random.Random) -> Any:
 
 def subspace(n: int, m: int, seed: int = 0, *, norm: float = 0.5) -> SubspaceBatch:
     """A template of nobody."""
-    with Keystream.seeded("fuzz", seed) as stream:
-        point = stream.normal((n,))
-        made = SubspaceBatch.through(
-            point / np.linalg.norm(point), stream.normal((m, n)), stream=stream
-        )
+    stream = Keystream.seeded("fuzz", seed)
+    point = stream.normal((n,))
+    made = SubspaceBatch.through(
+        point / np.linalg.norm(point), stream.normal((m, n)), stream=stream
+    )
     foot = made.foot.astype(np.float64)
     foot -= made.basis.T.astype(np.float64) @ (made.basis @ foot)
     return SubspaceBatch((foot * norm / np.linalg.norm(foot)).astype(np.float32), made.basis)

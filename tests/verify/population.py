@@ -42,8 +42,8 @@ def decoys() -> DecoyGenerator:
 
 def templates_of(descriptors: Floats, *, seed: int) -> SubspaceBatch:
     points = decoys().project(descriptors)
-    with Keystream.seeded("population", seed) as stream:
-        return lift(points, strategy=Strategy.ADVERSARIAL, m=M, source=decoys(), stream=stream)
+    stream = Keystream.seeded("population", seed)
+    return lift(points, strategy=Strategy.ADVERSARIAL, m=M, source=decoys(), stream=stream)
 
 
 @functools.cache

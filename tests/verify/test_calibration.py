@@ -42,9 +42,9 @@ def test_point_trials_agree_with_brute_force(most_templates: int | None) -> None
     )
     compared = plan.compared.tolist()
     lifter = Lifter(make_binding(source.source_id).strategy, source, "0" * 64)
-    with Keystream.seeded("test") as stream:
-        means = enrolled_means(people.descriptors, plan)[compared]
-        templates = lifter.lift(means, m=6, stream=stream)
+    stream = Keystream.seeded("test")
+    means = enrolled_means(people.descriptors, plan)[compared]
+    templates = lifter.lift(means, m=6, stream=stream)
     nobody = Nobody(source, lifter.strategy, 6, bytes(32))
     impostors, genuine = point_trials(
         people.descriptors,

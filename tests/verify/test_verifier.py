@@ -75,8 +75,8 @@ def lifted(
 
 def nobody(contract: Contract) -> StandIn:
     """What an unknown subject is decided against."""
-    with Keystream.seeded("nobody") as stream:
-        template = contract.nobody(make_generator()).lift(stream)
+    stream = Keystream.seeded("nobody")
+    template = contract.nobody(make_generator()).lift(stream)
     return StandIn(wire.encode(template, contract_id=contract.contract_id, dtype="float16"))
 
 

@@ -167,26 +167,25 @@ def _lifted(
         for side in ("first", "second")
     ]
     step = max(1, _TILE // unit.m)
-    with streams[0], streams[1]:
-        for start in range(0, len(trials), step):
-            rows = slice(start, min(start + step, len(trials)))
-            points, batches = [], []
-            for photos, source, stream in zip(
-                (trials.first[rows], trials.second[rows]), decoys, streams, strict=True
-            ):
-                embeddings = trials.embeddings[photos]
-                points.append(embeddings if source is None else source.project(embeddings))
-                batches.append(
-                    lift(
-                        points[-1],
-                        strategy=unit.strategy,
-                        m=unit.m,
-                        source=source,
-                        stream=stream,
-                        attributes=_attributes(trials, unit, photos),
-                    )
+    for start in range(0, len(trials), step):
+        rows = slice(start, min(start + step, len(trials)))
+        points, batches = [], []
+        for photos, source, stream in zip(
+            (trials.first[rows], trials.second[rows]), decoys, streams, strict=True
+        ):
+            embeddings = trials.embeddings[photos]
+            points.append(embeddings if source is None else source.project(embeddings))
+            batches.append(
+                lift(
+                    points[-1],
+                    strategy=unit.strategy,
+                    m=unit.m,
+                    source=source,
+                    stream=stream,
+                    attributes=_attributes(trials, unit, photos),
                 )
-            yield rows, (points[0], points[1]), (batches[0], batches[1])
+            )
+        yield rows, (points[0], points[1]), (batches[0], batches[1])
 
 
 def _sides(
@@ -203,8 +202,8 @@ def _sides(
 
 def split_pool(pool: DecoyPool, *, seed: int) -> tuple[DecoyPool, DecoyPool]:
     """Split a pool at random, half for enrollment, half for probes (docs/method.md §4.4)."""
-    with Keystream.seeded("evaluation", "halves", pool.source_id, seed) as stream:
-        order = stream.choose(len(pool), 1, len(pool))[0]
+    stream = Keystream.seeded("evaluation", "halves", pool.source_id, seed)
+    order = stream.choose(len(pool), 1, len(pool))[0]
     half = len(pool) // 2
     return pool.subset(np.sort(order[:half])), pool.subset(np.sort(order[half:]))
 

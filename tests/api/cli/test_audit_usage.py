@@ -112,8 +112,8 @@ def paths(world: World, folder: Path, arguments: Sequence[str]) -> list[str | Pa
 def write_decoys(world: World, folder: Path) -> None:
     """Decoys of another model, of another dimension, and of no model that they name."""
     known = DecoyGenerator.load(world.data / "decoys.veil")
-    with Keystream.seeded("decoys of a test") as stream:
-        drawn = known.draw(150, 1, stream=stream)[:, 0]
+    stream = Keystream.seeded("decoys of a test")
+    drawn = known.draw(150, 1, stream=stream)[:, 0]
     DecoyGenerator.fit(drawn, made_with="ab" * 32).save(folder / "other")
     DecoyGenerator.fit(drawn).save(folder / "unsaid")
     narrow = drawn[:, :32] / (drawn[:, :32] ** 2).sum(axis=1, keepdims=True) ** 0.5
@@ -258,8 +258,8 @@ def test_people_without_folders_are_refused(world: World, tmp_path: Path) -> Non
 @pytest.mark.usefixtures("before_any_face")
 def test_a_contract_of_other_decoys_is_refused(world: World, tmp_path: Path) -> None:
     known = DecoyGenerator.load(world.data / "decoys.veil")
-    with Keystream.seeded("other decoys of a test") as stream:
-        drawn = known.draw(150, 1, stream=stream)[:, 0]
+    stream = Keystream.seeded("other decoys of a test")
+    drawn = known.draw(150, 1, stream=stream)[:, 0]
     DecoyGenerator.fit(drawn, made_with=known.made_with).save(tmp_path / "other")
     contract = ("--contract", world.data / "contract.json")
     ran = templates(world, world.labelled, *contract, "--decoys", tmp_path / "other")

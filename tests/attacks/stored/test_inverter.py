@@ -56,11 +56,11 @@ def test_training_beats_its_start_where_decoys_differ_from_faces() -> None:
         return drawn / np.linalg.norm(drawn, axis=1, keepdims=True)
 
     def lift(people: np.ndarray, epoch: int) -> SubspaceBatch:
-        with Keystream.seeded("apart", epoch) as stream:
-            decoys = np.zeros((len(people), 4, 2 * half))
-            decoys[:, :, half:] = stream.normal((len(people), 4, half))
-            decoys /= np.linalg.norm(decoys, axis=2, keepdims=True)
-            return SubspaceBatch.through(people, decoys - people[:, None], stream=stream)
+        stream = Keystream.seeded("apart", epoch)
+        decoys = np.zeros((len(people), 4, 2 * half))
+        decoys[:, :, half:] = stream.normal((len(people), 4, half))
+        decoys /= np.linalg.norm(decoys, axis=2, keepdims=True)
+        return SubspaceBatch.through(people, decoys - people[:, None], stream=stream)
 
     inverter = train(rows(600), lift, foot_points, seconds=1e9, epochs=12, seed=0)
     people = rows(100)

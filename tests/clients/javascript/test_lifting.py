@@ -84,8 +84,8 @@ def test_decoys_have_the_moments_of_those_of_python(node: Node) -> None:
     )
     ours = unb64(answer["value"], "<f4").reshape(count, SOURCE.k).astype(np.float64)
     np.testing.assert_allclose(np.linalg.norm(ours, axis=1), 1, atol=1e-6)
-    with Keystream.seeded("decoys") as stream:
-        theirs = SOURCE.draw(1, 20 * count, stream=stream)[0].astype(np.float64)
+    stream = Keystream.seeded("decoys")
+    theirs = SOURCE.draw(1, 20 * count, stream=stream)[0].astype(np.float64)
     mean = theirs.mean(axis=0)
     variances, axes = np.linalg.eigh(np.cov(theirs, rowvar=False))
     deviations = (ours - mean) @ axes / np.sqrt(variances)
@@ -156,15 +156,15 @@ def test_a_lift_s_directions_are_decoys(node: Node) -> None:
     }
     answers = node("lift.js", [question] * 400)
     ours = [np.linalg.norm(unb64(answer["value"]["foot"], "<f4")) for answer in answers]
-    with Keystream.seeded("lifts") as stream:
-        point = SOURCE.project(embedding[None])
-        theirs = lift(
-            np.repeat(point, 4000, axis=0),
-            strategy=Strategy.ADVERSARIAL,
-            m=8,
-            source=SOURCE,
-            stream=stream,
-        )
+    stream = Keystream.seeded("lifts")
+    point = SOURCE.project(embedding[None])
+    theirs = lift(
+        np.repeat(point, 4000, axis=0),
+        strategy=Strategy.ADVERSARIAL,
+        m=8,
+        source=SOURCE,
+        stream=stream,
+    )
     assert ks_2samp(ours, np.linalg.norm(theirs.feet, axis=1)).pvalue > 1e-6
 
 

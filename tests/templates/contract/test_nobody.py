@@ -30,17 +30,17 @@ def nobody(strategy: Strategy = Strategy.ADVERSARIAL, *, seed: int = 0) -> Nobod
 
 
 def templates(strategy: Strategy) -> SubspaceBatch:
-    with Keystream.seeded("templates of nobody", strategy) as stream:
-        points = generator().draw(TEMPLATES, 1, stream=stream)[:, 0]
-        return lift(points, strategy=strategy, m=M, source=generator(), stream=stream)
+    stream = Keystream.seeded("templates of nobody", strategy)
+    points = generator().draw(TEMPLATES, 1, stream=stream)[:, 0]
+    return lift(points, strategy=strategy, m=M, source=generator(), stream=stream)
 
 
 @pytest.mark.parametrize("metric", list(Metric))
 @pytest.mark.parametrize("strategy", STRATEGIES)
 def test_mean_and_spread_are_those_of_lifted_templates(strategy: Strategy, metric: Metric) -> None:
     """For people, who are drawn, and for wolves: axes and the mean."""
-    with Keystream.seeded("people") as stream:
-        people = generator().draw(60, 1, stream=stream)[:, 0]
+    stream = Keystream.seeded("people")
+    people = generator().draw(60, 1, stream=stream)[:, 0]
     mean = generator().mean / np.linalg.norm(generator().mean)
     probes = np.concatenate([people, np.eye(K)[:10], mean[None]]).astype(np.float32)
     close = np.asarray(
@@ -59,8 +59,8 @@ def test_mean_and_spread_are_those_of_lifted_templates(strategy: Strategy, metri
 
 
 def test_a_wolf_expects_more_than_people() -> None:
-    with Keystream.seeded("people") as stream:
-        people = generator().draw(60, 1, stream=stream)[:, 0]
+    stream = Keystream.seeded("people")
+    people = generator().draw(60, 1, stream=stream)[:, 0]
     means, _ = nobody().statistics(people, Metric.SPHERICAL)
     wolf, _ = nobody().statistics(np.eye(K, dtype=np.float32)[:1], Metric.SPHERICAL)
     assert wolf[0] > means.max()
@@ -68,8 +68,8 @@ def test_a_wolf_expects_more_than_people() -> None:
 
 @pytest.mark.parametrize("strategy", STRATEGIES)
 def test_similarity_to_strangers_is_that_of_drawn_people(strategy: Strategy) -> None:
-    with Keystream.seeded("strangers") as stream:
-        people = generator().draw(4000, 1, stream=stream)[:, 0]
+    stream = Keystream.seeded("strangers")
+    people = generator().draw(4000, 1, stream=stream)[:, 0]
     some = templates(strategy)[:20]
     close = similarity(pairwise_distances(people, some, metric=Metric.SPHERICAL)).mean(axis=0)
     np.testing.assert_allclose(nobody(strategy).stranger_similarity(some), close, atol=0.02)
@@ -110,6 +110,6 @@ def test_the_cohort_follows_the_seed_and_is_lifted_once(monkeypatch: pytest.Monk
     monkeypatch.undo()
     np.testing.assert_array_equal(nobody().cohort.feet, own.cohort.feet)
     assert not np.allclose(nobody(seed=1).cohort.feet, own.cohort.feet)
-    with Keystream.seeded("one") as stream:
-        one = own.lift(stream)
+    stream = Keystream.seeded("one")
+    one = own.lift(stream)
     assert (one.n, one.m) == (K, M)

@@ -32,8 +32,8 @@ def kinds(shared_data: Path) -> dict[str, tuple[Rows, list[str]]]:
 
 def divergence(source: DecoyGenerator, people: Rows) -> float:
     """Kullback and Leibler's, of the decoys' covariance from that of people, in nats."""
-    with Keystream.seeded("faces") as stream:
-        decoys = np.cov(source.draw(10_000, 1, stream=stream)[:, 0], rowvar=False)
+    stream = Keystream.seeded("faces")
+    decoys = np.cov(source.draw(10_000, 1, stream=stream)[:, 0], rowvar=False)
     ratio = np.linalg.solve(decoys, np.cov(source.project(people), rowvar=False))
     return 0.5 * float(np.trace(ratio) - len(ratio) - np.linalg.slogdet(ratio)[1])
 

@@ -62,12 +62,6 @@ def test_a_blob_is_the_documented_format() -> None:
     assert cipher.decrypt(sealed[9:21], sealed[21:], aad) == b"text"
 
 
-def test_nonces_differ() -> None:
-    keyring = MasterKeyring([KEY])
-    sealed = {keyring.seal(b"same", purpose="p", bound_to=[]) for _ in range(100)}
-    assert len({blob[9:21] for blob in sealed}) == 100
-
-
 @given(first=parts, second=parts)
 def test_different_parts_have_different_encodings(first: Parts, second: Parts) -> None:
     same = first == second and [type(part) for part in first] == [type(part) for part in second]
@@ -100,12 +94,6 @@ def test_a_truncated_blob_is_refused(length: int) -> None:
     sealed = keyring.seal(b"", purpose="p", bound_to=[])[:length]
     with pytest.raises(SealError, match="at least"):
         keyring.open(sealed, purpose="p", bound_to=[])
-
-
-def test_another_key_is_named_in_the_error() -> None:
-    sealed = MasterKeyring([KEY]).seal(b"text", purpose="p", bound_to=[])
-    with pytest.raises(SealError, match=sealed_key_id(sealed)):
-        MasterKeyring([OTHER]).open(sealed, purpose="p", bound_to=[])
 
 
 def test_an_older_key_still_opens() -> None:
@@ -170,13 +158,8 @@ def test_a_file_that_others_may_use_is_refused(tmp_path: Path, mode: int) -> Non
         ([base64.b64encode(KEY) + b" " + base64.b64encode(OTHER)], "not base64"),
         ([base64.b64encode(KEY[:31])], "31 bytes"),
         ([base64.b64encode(KEY + b"x")], "33 bytes"),
-        ([base64.b64encode(bytes(32))], "pattern"),
-        ([base64.b64encode(b"\xaa" * 32)], "pattern"),
-        ([base64.b64encode(bytes(range(32)))], "pattern"),
-        ([base64.b64encode(KEY[:16] * 2)], "pattern"),
-        ([base64.b64encode(b"correct horse battery staple 32!")], "readable text"),
         ([base64.b64encode(KEY), base64.b64encode(KEY)], "same key twice"),
-        ([base64.b64encode(KEY), base64.b64encode(bytes(32))], "key 2"),
+        ([base64.b64encode(KEY), base64.b64encode(b"short")], "key 2"),
         ([b"A" * 100_000], "more than"),
     ],
 )
@@ -201,6 +184,8 @@ def test_rotating_the_file_is_followed_while_running(tmp_path: Path) -> None:
     sealed = running.seal(b"old", purpose="p", bound_to=[])
 
     second = MasterKeyring.add_current(tmp_path / "key")
+    new = MasterKeyring.load(tmp_path / "key").seal(b"new", purpose="p", bound_to=[])
+    assert running.open(new, purpose="p", bound_to=[]) == b"new"
     assert running.key_ids == (second, first)
     assert (tmp_path / "key").stat().st_mode & 0o777 == 0o600
     assert sealed_key_id(running.seal(b"new", purpose="p", bound_to=[])) == second
@@ -210,13 +195,6 @@ def test_rotating_the_file_is_followed_while_running(tmp_path: Path) -> None:
     assert list(running.key_ids) == [second]
     with pytest.raises(SealError, match=first):
         running.open(sealed, purpose="p", bound_to=[])
-
-
-def test_a_blob_under_a_key_that_was_just_added_opens(tmp_path: Path) -> None:
-    running = MasterKeyring.create(tmp_path / "key")
-    MasterKeyring.add_current(tmp_path / "key")
-    sealed = MasterKeyring.load(tmp_path / "key").seal(b"new", purpose="p", bound_to=[])
-    assert running.open(sealed, purpose="p", bound_to=[]) == b"new"
 
 
 @pytest.mark.parametrize(
@@ -261,22 +239,6 @@ def test_no_key_is_dropped_once_another_one_came_first(tmp_path: Path) -> None:
     assert MasterKeyring.load(path).key_ids == (later,)
 
 
-def test_a_link_to_the_key_file_stays_a_link(tmp_path: Path) -> None:
-    real, link = tmp_path / "real", tmp_path / "link"
-    real.mkdir()
-    first = MasterKeyring.create(real / "key").current
-    (tmp_path / "middle").symlink_to("real/key")
-    link.symlink_to("middle")
-    running = MasterKeyring.load(real / "key")
-    second = MasterKeyring.add_current(link)
-    assert link.is_symlink()
-    assert (tmp_path / "middle").is_symlink()
-    assert MasterKeyring.load(link).key_ids == running.key_ids == (second, first)
-    assert MasterKeyring.drop_retired(link, keep=second) == 1
-    assert list(running.key_ids) == [second]
-    assert {each.name for each in real.iterdir()} == {"key"}
-
-
 @as_root
 def test_root_does_not_work_on_the_key_file_of_another_user(tmp_path: Path) -> None:
     path = tmp_path / "key"
@@ -301,28 +263,23 @@ def test_keys_do_not_show(tmp_path: Path) -> None:
 
 
 def test_a_bad_key_is_not_quoted_in_the_error(tmp_path: Path) -> None:
-    text = b"correct horse battery staple 32!"
+    text = b"correct horse battery staple"
     with pytest.raises(SealError) as caught:
         MasterKeyring.load(write(tmp_path / "key", base64.b64encode(text)))
     assert "correct" not in str(caught.value)
     assert base64.b64encode(text).decode() not in str(caught.value)
 
 
-def test_the_sealer_binds_context_and_purpose() -> None:
-    keyring = MasterKeyring([KEY])
-    pool = KeyringSealer(keyring, purpose="decoys")
-    sealed = pool.seal(b"rows", context="pool 1")
-    assert pool.open(sealed, context="pool 1") == b"rows"
-    assert KeyringSealer(MasterKeyring([OTHER, KEY]), purpose="decoys").open(
-        sealed, context="pool 1"
-    )
-    for sealer, context in (
-        (pool, "pool 2"),
-        (KeyringSealer(keyring, purpose="cache"), "pool 1"),
-        (KeyringSealer(MasterKeyring([OTHER]), purpose="decoys"), "pool 1"),
+def test_the_sealer_binds_its_context() -> None:
+    sealer = KeyringSealer(MasterKeyring([KEY]))
+    sealed = sealer.seal(b"rows", context="pool 1")
+    assert sealer.open(sealed, context="pool 1") == b"rows"
+    for other, context in (
+        (sealer, "pool 2"),
+        (KeyringSealer(MasterKeyring([OTHER])), "pool 1"),
     ):
         with pytest.raises(SealError):
-            sealer.open(sealed, context=context)
+            other.open(sealed, context=context)
 
 
 def lines_of(*keys: bytes) -> str:
@@ -341,7 +298,7 @@ def test_keys_come_from_the_environment(monkeypatch: pytest.MonkeyPatch, separat
 
 @pytest.mark.parametrize(
     ("text", "message"),
-    [("", "holds no key"), (lines_of(KEY, bytes(range(32))), "key 2 .* pattern")],
+    [("", "holds no key"), (lines_of(KEY, OTHER[:31]), "key 2 .* 31 bytes")],
 )
 def test_bad_keys_in_the_environment_are_refused(
     monkeypatch: pytest.MonkeyPatch, text: str, message: str
@@ -353,33 +310,9 @@ def test_bad_keys_in_the_environment_are_refused(
     assert not any(line in str(caught.value) for line in text.split())
 
 
-def test_an_unset_variable_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("VEILFACE_TEST_KEYS", raising=False)
+def test_an_unset_variable_is_named() -> None:
     with pytest.raises(SealError, match="VEILFACE_TEST_KEYS is not set"):
         MasterKeyring.from_environment("VEILFACE_TEST_KEYS")
-
-
-@pytest.mark.parametrize(("mode", "good"), [(0o777, False), (0o1777, True), (0o755, True)])
-def test_a_folder_that_others_may_write_to_is_refused(
-    tmp_path: Path, mode: int, good: bool
-) -> None:
-    folder, link = tmp_path / "keys", tmp_path / "link"
-    folder.mkdir()
-    current = MasterKeyring.create(folder / "key").current
-    link.symlink_to(folder / "key")
-    folder.chmod(mode)
-    for path in (folder / "key", link):
-        if good:
-            assert MasterKeyring.load(path).current == current
-            continue
-        with pytest.raises(SealError, match="chmod o-w"):
-            MasterKeyring.load(path)
-        with pytest.raises(SealError, match="chmod o-w"):
-            MasterKeyring.add_current(path)
-    if not good:
-        with pytest.raises(SealError, match="chmod o-w"):
-            MasterKeyring.create(folder / "new")
-        assert not (folder / "new").exists()
 
 
 # --- credentials of systemd ----------------------------------------------------------------

@@ -37,11 +37,9 @@ class Listed:
         self.n = self.k = draws[0].shape[-1]
         self.draws = list(draws)
         self.asked: list[tuple[int, int, Sequence[Attributes] | None, int | None]] = []
-        self.streams: list[Keystream] = []
 
     def draw(self, rows, k, *, stream, unlike=None, sub_databases=None):
         self.asked.append((rows, k, unlike, sub_databases))
-        self.streams.append(stream)
         decoys = self.draws.pop(0) if len(self.draws) > 1 else self.draws[0]
         return np.broadcast_to(decoys[..., :k, :], (rows, k, self.n)).astype(np.float32)
 
@@ -122,15 +120,6 @@ def test_two_lifts_differ_and_meet_in_the_descriptor(pool: DecoyPool):
     assert np.abs(one.foot - two.foot).max() > 1e-3
     assert one.contains(descriptor).all()
     assert two.contains(descriptor).all()
-
-
-def test_every_template_gets_its_own_key_which_is_destroyed():
-    source = Listed(units(Keystream.seeded("decoys"), 4))
-    lift(units(Keystream.seeded(1), 3), strategy="adversarial", m=4, source=source)
-    assert len(set(map(id, source.streams))) == 3
-    for stream in source.streams:
-        with pytest.raises(ValueError, match="destroyed"):
-            stream.token(1)
 
 
 def test_a_seeded_batch_does_not_depend_on_the_tile(

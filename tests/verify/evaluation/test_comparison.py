@@ -54,16 +54,16 @@ def test_each_side_is_lifted_and_the_other_compared_with_it() -> None:
     # Lift the sides again, from the streams of the unit, and measure by least squares.
     sides = []
     for name, photos in (("first", known.first), ("second", known.second)):
-        with Keystream.seeded("evaluation", name, Strategy.ADVERSARIAL, 4, 3) as stream:
-            sides.append(
-                lift(
-                    known.embeddings[photos],
-                    strategy="adversarial",
-                    m=4,
-                    source=known.sources[0],
-                    stream=stream,
-                )
+        stream = Keystream.seeded("evaluation", name, Strategy.ADVERSARIAL, 4, 3)
+        sides.append(
+            lift(
+                known.embeddings[photos],
+                strategy="adversarial",
+                m=4,
+                source=known.sources[0],
+                stream=stream,
             )
+        )
     for row in range(40):
         a, b = known.embeddings[known.first[row]], known.embeddings[known.second[row]]
         first, second = sides[0][row], sides[1][row]
@@ -86,8 +86,8 @@ def test_both_photos_are_projected_on_the_axes_of_a_generator() -> None:
     probes, enrolled = (
         source.project(known.embeddings[photos]) for photos in (known.second, known.first)
     )
-    with Keystream.seeded("evaluation", "first", Strategy.ADVERSARIAL, 4, 3) as stream:
-        lifted = lift(enrolled, strategy="adversarial", m=4, source=source, stream=stream)
+    stream = Keystream.seeded("evaluation", "first", Strategy.ADVERSARIAL, 4, 3)
+    lifted = lift(enrolled, strategy="adversarial", m=4, source=source, stream=stream)
     for row in range(30):
         distance = residual(probes[row], lifted[row].foot, lifted[row].basis)
         assert found[row] == pytest.approx(similarity(distance), abs=1e-5)
