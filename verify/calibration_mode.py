@@ -11,7 +11,7 @@ from templates.contract.canonical import Json
 from templates.contract.document import Calibration
 from templates.contract.levels import photos_in_words
 from templates.contract.nobody import Nobody
-from templates.distances import DEFAULT_STEPS, Metric
+from templates.distances import Metric
 from templates.errors import ContractError
 from templates.keys.randomness import Keystream
 from templates.space.subspace import SubspaceBatch
@@ -45,6 +45,10 @@ Protocol: TypeAlias = Literal["fmr", "ten-fold"]
 ACCURACY_LEVEL = "accuracy"
 GROUPED = 10 / 3
 """How many more comparisons are made where people are labelled: a group has a part of them."""
+
+STEPS = 20
+"""Steps of the iteration that decides a lifted probe: 50 take longer and reject no fewer
+(docs/method.md §3.5)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,7 +87,7 @@ class CalibrationOptions:
 
     protocol: Protocol = "fmr"
     metric: Metric = Metric.SPHERICAL
-    steps: int = DEFAULT_STEPS
+    steps: int = STEPS
     probe_dims: tuple[int, ...] = (0,)
     probe_photos: tuple[int, ...] = (1, 2, 3, 5)
     least_people: int = 50

@@ -24,11 +24,12 @@ from models.pack import ModelPack
 from templates.contract.document import Binding, Calibration, Contract, Level, Rate
 from templates.contract.verdict import Judgement, Verdict
 from templates.decoys import DecoyGenerator, DecoySource
-from templates.distances import DEFAULT_STEPS, Metric
+from templates.distances import Metric
 from templates.keys.rotation import ROTATION_VERSION
 from templates.space.lifting import Strategy
 from templates.store.api_keys import Right
 from tests.databases import migrate_ahead
+from verify.calibration_mode import STEPS
 
 N = 64
 AXES = 60
@@ -121,8 +122,8 @@ def make_contract(
         Level("accuracy", None, 2.0, RATE, RATE),
     )
     calibrations = (
-        Calibration("p2s", Metric.SPHERICAL, 0, DEFAULT_STEPS, levels, None),
-        Calibration("s2s", Metric.SPHERICAL, PROBE_M, DEFAULT_STEPS, levels, (0.3, 0.95)),
+        Calibration("p2s", Metric.SPHERICAL, 0, STEPS, levels, None),
+        Calibration("s2s", Metric.SPHERICAL, PROBE_M, STEPS, levels, (0.3, 0.95)),
     )
     return Contract(
         binding=binding,
