@@ -225,7 +225,7 @@ def evaluate(
 def _summary(results: Json, dataset: str) -> Table:
     rows = [row for row in results["rows"] if row["dataset"] == dataset]
     counts = f"{rows[0]['n_genuine']} genuine and {rows[0]['n_impostor']} impostor pairs"
-    return Table(f"{dataset}: {counts}", *row_cells(rows, details=False))
+    return Table(f"{dataset}: {counts}", *row_cells(rows))
 
 
 def _rates(text: str) -> tuple[float, ...]:

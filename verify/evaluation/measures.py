@@ -11,9 +11,6 @@ from verify.tenfold import best_grid_threshold, best_threshold, ten_fold
 
 Array64 = NDArray[np.float64]
 
-COLLISION = 1e-3
-"""Two subspaces nearer than this share a decoy: distinct faces are never that close."""
-
 
 def measure(
     similarities: Array64,
@@ -38,11 +35,8 @@ def measure(
     -------
     accuracies, thresholds
         Of the ten folds; None without folds.
-    eer, auc, d_prime
-        Equal error rate; area under the ROC; (μ_g − μ_i) / √((σ_g² + σ_i²) / 2) of similarities,
-        None where neither class has any spread: JSON has no infinity.
-    collisions
-        Impostor pairs at a distance below ``COLLISION``.
+    eer, auc
+        Equal error rate; area under the ROC.
     fnmr_at_fmr
         By target: the lowest threshold whose FMR is at most the target, ``errors`` of ``trials``
         genuine pairs below it, ``fmr_errors`` of ``fmr_trials`` impostor pairs at or above it.
@@ -58,8 +52,6 @@ def measure(
         "thresholds": None if tenth is None else list(tenth.thresholds),
         "eer": equal_error_rate(genuine, impostor)[0],
         "auc": area_under_roc(genuine, impostor),
-        "d_prime": d_prime(genuine, impostor),
-        "collisions": int(np.count_nonzero(2 - 2 * impostor < COLLISION**2)),
         "fnmr_at_fmr": {
             f"{target:g}": errors_at(genuine, impostor, target)
             for target in targets
@@ -85,12 +77,3 @@ def area_under_roc(genuine: Array64, impostor: Array64) -> float:
     ranked = np.sort(impostor)
     below, not_above = (np.searchsorted(ranked, genuine, side) for side in ("left", "right"))
     return float((below + not_above).sum() / (2 * genuine.size * impostor.size))
-
-
-def d_prime(genuine: Array64, impostor: Array64) -> float | None:
-    """Separation of the two distributions in pooled standard deviations; 0 where both are one."""
-    spread = np.sqrt((genuine.var() + impostor.var()) / 2)
-    gap = float(genuine.mean() - impostor.mean())
-    if spread > 0:
-        return float(gap / spread)
-    return None if gap else 0.0

@@ -2,16 +2,10 @@
 
 from collections.abc import Sequence
 from dataclasses import asdict
-from math import comb
 
 import numpy as np
 import pandas as pd
 
-from templates.contract import wire
-from templates.contract.binding import Binding
-from templates.decoys import DecoyPool
-from templates.keys.rotation import ROTATION_VERSION
-from templates.space.lifting import Strategy
 from verify.evaluation.comparison import Trials
 from verify.evaluation.experiment import (
     ARRAYS,
@@ -22,10 +16,10 @@ from verify.evaluation.experiment import (
 )
 from verify.evaluation.intervals import fmr_grid, percentiles
 from verify.evaluation.labels_file import Labels
-from verify.evaluation.plan import EvaluationPlan, Json, Mode, Source, decoy_kind
+from verify.evaluation.plan import EvaluationPlan, Json
 from verify.evaluation.provenance import Model, software
 from verify.evaluation.readers import notes
-from verify.evaluation.sources import SourceFacts, resemblance
+from verify.evaluation.sources import SourceFacts
 from verify.metrics import resolvable, wilson
 from verify.tenfold import FOLDS
 
@@ -47,7 +41,7 @@ def document(
     trials = {result.trials.name: result.trials for result in results}
     rows, curves = [], []
     for names, lines in runs.groupby(ROW, sort=False, dropna=False):
-        rows.append(row_of(lines, trials[names[0]], plan, model))
+        rows.append(row_of(lines, trials[names[0]], plan))
         if rows[-1]["threshold_search"] == "exact":
             curves.append(curve_of(lines, trials[names[0]]))
     groups, summaries = ([], []) if labels is None else group_rates(runs, results, labels, plan)
@@ -64,11 +58,6 @@ def document(
                 result.trials.name: result.predicted
                 for result in results
                 if result.predicted is not None
-            },
-            "resemblance": {
-                name: resemblance(one)
-                for name, one in trials.items()
-                if any(isinstance(source, DecoyPool) for source in one.sources)
             },
         },
         "model": model.json(),
@@ -113,22 +102,18 @@ def _dataset(result: SetResult) -> Json:
     }
 
 
-def row_of(lines: pd.DataFrame, trials: Trials, plan: EvaluationPlan, model: Model) -> Json:
+def row_of(lines: pd.DataFrame, trials: Trials, plan: EvaluationPlan) -> Json:
     """Summarise the runs of one row.
 
     ``accuracy_std`` is the spread over folds inside a run, ``accuracy_std_seeds`` that of the
     mean accuracy over seeds, None where there are not two. Of the two sides of point-to-subspace
     comparisons every figure is the mean.
     """
-    names = lines.iloc[0][ROW].to_dict()
-    kind, spaces = names["decoys"], names["mode"] == Mode.SUBSPACE
-    source = next((source for source in trials.sources if decoy_kind(source) == kind), None)
     return {
-        **names,
+        **lines.iloc[0][ROW].to_dict(),
         **_accuracy(lines),
         "eer": float(lines["eer"].mean()),
         "auc": float(lines["auc"].mean()),
-        "d_prime": None if lines["d_prime"].isna().any() else float(lines["d_prime"].mean()),
         "fnmr_at_fmr": {
             target: _at(lines, place, target, trials)
             for place, target in enumerate(lines["fnmr_at_fmr"].iloc[0])
@@ -138,10 +123,6 @@ def row_of(lines: pd.DataFrame, trials: Trials, plan: EvaluationPlan, model: Mod
         "failed_genuine": trials.failed_genuine,
         "failed_impostor": trials.failed_impostor,
         "runs": len(lines),
-        "collision_floor": collision_floor(names, source) if spaces else None,
-        "collisions_mean": float(lines["collisions"].mean()) if spaces else None,
-        "template_bytes": template_bytes(names, model.n if source is None else source.k),
-        "contract_id": contract_id(model, names, source),
         "seed": plan.seed,
     }
 
@@ -149,7 +130,7 @@ def row_of(lines: pd.DataFrame, trials: Trials, plan: EvaluationPlan, model: Mod
 def _accuracy(lines: pd.DataFrame) -> Json:
     if lines["accuracies"].iloc[0] is None:
         names = ("accuracy_mean", "accuracy_std", "accuracy_std_seeds", "threshold_mean")
-        return {**dict.fromkeys(names), "thresholds": None}
+        return dict.fromkeys(names)
     accuracies, thresholds = (np.stack(lines[name]) for name in ("accuracies", "thresholds"))
     seeds = lines.assign(mean=accuracies.mean(axis=1)).groupby("seed", dropna=False)["mean"].mean()
     return {
@@ -157,28 +138,24 @@ def _accuracy(lines: pd.DataFrame) -> Json:
         "accuracy_std": float(accuracies.std(axis=1).mean()),
         "accuracy_std_seeds": float(seeds.std()) if len(seeds) > 1 else None,
         "threshold_mean": float(thresholds.mean()),
-        "thresholds": thresholds.mean(axis=0).tolist(),
     }
 
 
 def _at(lines: pd.DataFrame, place: int, target: str, trials: Trials) -> Json:
     means = pd.DataFrame([at[target] for at in lines["fnmr_at_fmr"]]).mean()
-    value, fmr = means["errors"] / trials.genuine, means["fmr_errors"] / trials.impostor
     low, high = wilson(means["errors"], trials.genuine)
     # With few errors, resampling what was seen knows nothing of what was not: hence both.
     lower, upper = percentiles(np.stack(lines["replicates"])[:, :, place, None])
     return {
-        "value": float(value),
+        "value": float(means["errors"] / trials.genuine),
         "ci_low": min(low, float(lower[0])),
         "ci_high": max(high, float(upper[0])),
         "interval": _interval(trials),
         "trials": trials.genuine,
         "errors_mean": float(means["errors"]),
         "threshold_mean": float(means["threshold"]),
-        "fmr": float(fmr),
+        "fmr": float(means["fmr_errors"] / trials.impostor),
         "fmr_errors_mean": float(means["fmr_errors"]),
-        "far": float(fmr * (1 - trials.fta)),
-        "frr": float(trials.fta + value * (1 - trials.fta)),
     }
 
 
@@ -199,52 +176,6 @@ def curve_of(lines: pd.DataFrame, trials: Trials) -> Json:
         "high": high.tolist(),
         "interval": _interval(trials),
     }
-
-
-def template_bytes(names: Json, n: int) -> int:
-    """Bytes that a stored template has: on the wire, in float16; raw embeddings as float32."""
-    if names["mode"] == Mode.RAW:
-        return 4 * n
-    return wire.encoded_size(n, names["dim"], "float16")
-
-
-def collision_floor(names: Json, source: Source | None) -> float | None:
-    """Probability that two independent lifts share a decoy (docs/method.md §4.4).
-
-    They then meet, whoever they are of: a floor of the false match rate in subspace-to-subspace
-    comparisons. 0 for disjoint and for generated decoys. None for hybrid+, whose draws depend on
-    the people.
-    """
-    strategy = Strategy(names["strategy"])
-    if not isinstance(source, DecoyPool) or not names["shared_decoys"]:
-        return 0.0
-    if strategy is Strategy.HYBRID_PLUS:
-        return None
-    k, parts = strategy.decoys(names["dim"]), strategy.sub_databases or 1
-    size = len(source) // parts
-    if k == 0 or size == 0:
-        return 0.0
-    return (1 - comb(size - k, k) / comb(size, k)) / parts
-
-
-def contract_id(model: Model, names: Json, source: Source | None) -> str | None:
-    """Contract that templates of a row belong to; None where none can be made.
-
-    A contract binds an embedder and a decoy source, so raw embeddings, random lifting and
-    embeddings from a file have none.
-    """
-    if source is None or model.embedder_sha256 is None or model.preprocessing is None:
-        return None
-    return Binding(
-        embedder_sha256=model.embedder_sha256,
-        preprocessing=model.preprocessing,
-        n=model.n,
-        axes=source.k,
-        strategy=Strategy(names["strategy"]),
-        m=names["dim"],
-        decoy_source_id=source.source_id,
-        rotation_version=ROTATION_VERSION,
-    ).contract_id
 
 
 def refused_targets(targets: Sequence[float], impostors: dict[str, int]) -> list[str]:

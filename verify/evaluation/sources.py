@@ -7,7 +7,6 @@ import numpy as np
 
 from templates.decoys import DecoyPool
 from verify.evaluation.attributes import resembling_rows
-from verify.evaluation.comparison import Trials
 from verify.evaluation.embedding import EmbeddedSet
 from verify.evaluation.plan import EvaluationError, Json, Source, decoy_kind
 
@@ -76,10 +75,3 @@ def without_test_people(
             pool = pool.subset(np.setdiff1d(np.arange(len(pool)), alike))
         kept.append(replace(facts, source=pool, left_out=len(alike)))
     return kept
-
-
-def resemblance(trials: Trials) -> Json:
-    """State from which cosine decoys were left out, and which share of genuine pairs is below."""
-    first, second = (trials.embeddings[side[trials.same]] for side in (trials.first, trials.second))
-    cosines = np.einsum("ij,ij->i", first, second, dtype=np.float64)
-    return {"cosine": SAME_PERSON, "genuine_below": float(np.mean(cosines < SAME_PERSON))}

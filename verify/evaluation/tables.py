@@ -78,18 +78,10 @@ _NAMES: list[Column] = [
     ("matching", lambda row: MODE_NAMES[row["mode"]]),
     ("metric", lambda row: METRIC_NAMES[row["metric"]]),
 ]
-_DETAILS: list[Column] = [
-    ("AUC", lambda row: fixed(row["auc"], 5)),
-    ("d'", lambda row: fixed(row["d_prime"], 2)),
-    ("collision floor %", lambda row: percent(row["collision_floor"])),
-    ("collisions", lambda row: fixed(row["collisions_mean"], 1)),
-    ("runs", lambda row: str(row["runs"])),
-    ("template bytes", lambda row: count(row["template_bytes"])),
-]
 
 
-def row_cells(rows: Sequence[Row], *, details: bool) -> Cells:
-    """Say what was compared, its accuracy and its error rates; with details everything else."""
+def row_cells(rows: Sequence[Row]) -> Cells:
+    """Say what was compared, its accuracy and its error rates."""
     targets = [
         (f"FNMR % at FMR {power(target)}", lambda row, t=target: _fnmr(row, t))
         for target in fmr_targets(rows)
@@ -99,7 +91,6 @@ def row_cells(rows: Sequence[Row], *, details: bool) -> Cells:
         ("accuracy %", accuracy),
         ("EER %", lambda row: percent(row["eer"])),
         *targets,
-        *(_DETAILS if details else []),
     ]
     return _cells(columns, rows)
 
@@ -132,7 +123,7 @@ def markdown(results: Mapping[str, Any]) -> str:
             for part in ("rows", "group_summaries", "groups")
         )
         parts += [f"## {plain(name)}", *_dataset(dataset, rows)]
-        parts.append(_table(*row_cells(rows, details=True)))
+        parts.append(_table(*row_cells(rows)))
         if groups:
             parts += ["### By group", GROUPS, *_group_tables(groups, summaries)]
     if results["refused"]:
@@ -152,8 +143,7 @@ HOW_TO_READ = """## How to read this
 - Accuracy: the threshold is chosen on nine folds and applied to the tenth; ± is the standard deviation over the ten folds, (±) that over seeds of the lifting. A lifted row is compared with raw by the exact search; the grid is the literature's.
 - FNMR at FMR: the threshold lets at most that share of impostor pairs through on all folds together; in brackets the 95 % interval (bootstrap by subject where the people are known, else bootstrap of pairs, both never narrower than Wilson's), in parentheses errors (mean over runs) of trials.
 - p-to-s compares a raw probe with a lifted template, s-to-s two lifted ones; p-to-s rows average the metrics of lifting either side. m is the dimension of the subspace; the spherical distance uses that embeddings have norm 1.
-- Collision floor: the share of impostor pairs expected to share decoys and so to be at distance 0; no threshold brings the FMR below it. Collisions are impostor pairs seen closer than 1e-3.
-- Failures to acquire are in none of these rates; FAR and FRR, which count them, thresholds per fold and full precision are in results.csv, single runs in results.json. "-" means not measured."""  # noqa: E501
+- Failures to acquire are in none of these rates. Full precision is in results.csv, single runs with their folds in results.json. "-" means not measured."""  # noqa: E501
 
 
 def _provenance(results: Row) -> str:

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from sklearn.metrics import roc_auc_score
 from sklearn.model_selection import KFold
 
-from verify.evaluation.measures import d_prime, measure
+from verify.evaluation.measures import measure
 from verify.evaluation.verification_set import contiguous_folds
 from verify.tenfold import best_grid_threshold, ten_fold
 
@@ -52,8 +52,6 @@ def test_figures_equal_those_of_independent_code(seed: int) -> None:
     found = measure(similarities, same, contiguous_folds(200), targets=(0.5, 0.05, 1e-3))
     assert found["auc"] == pytest.approx(roc_auc_score(same, similarities))
     mated, other = similarities[same], similarities[~same]
-    spread = np.sqrt((np.var(mated) + np.var(other)) / 2)
-    assert found["d_prime"] == pytest.approx((mated.mean() - other.mean()) / spread)
     assert list(found["fnmr_at_fmr"]) == ["0.5", "0.05"]
     for target, at in found["fnmr_at_fmr"].items():
         assert at["fmr_errors"] == np.count_nonzero(other >= at["threshold"])
@@ -71,16 +69,3 @@ def test_without_folds_there_are_error_rates_and_no_accuracy() -> None:
     assert (found["accuracies"], found["thresholds"]) == (None, None)
     assert found["fnmr_at_fmr"] == folded["fnmr_at_fmr"]
     assert found["eer"] == folded["eer"]
-
-
-def test_pairs_that_meet_are_collisions() -> None:
-    similarities = np.array([1.0, 1 - 1e-6**2, 1 - 1e-2, 0.0] * 10)
-    same = np.array([False, False, False, True] * 10)
-    found = measure(similarities, same, contiguous_folds(40), targets=())
-    assert found["collisions"] == 20
-
-
-def test_separation_without_spread() -> None:
-    # JSON has no infinity.
-    assert d_prime(np.ones(3), np.zeros(3)) is None
-    assert d_prime(np.ones(3), np.ones(3)) == 0

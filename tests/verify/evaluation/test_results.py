@@ -11,7 +11,7 @@ import pytest
 from models.extraction import Failure
 from templates.distances import Metric
 from tests.verify.evaluation.made_results import made_faces, made_results, verification_set
-from tests.verify.evaluation.made_trials import N, made_trials, pool
+from tests.verify.evaluation.made_trials import made_trials
 from verify.datasets import DatasetError
 from verify.evaluation.comparison import Trials
 from verify.evaluation.experiment import (
@@ -22,8 +22,7 @@ from verify.evaluation.experiment import (
 )
 from verify.evaluation.intervals import replicate_weights
 from verify.evaluation.plan import EvaluationPlan, Mode
-from verify.evaluation.provenance import Model
-from verify.evaluation.results import collision_floor, row_of
+from verify.evaluation.results import row_of
 from verify.metrics import threshold_at_fmr, wilson
 
 # One kind of run whose lifts differ much, so that the draw of runs shows.
@@ -66,7 +65,7 @@ def test_rows_are_means_of_their_runs() -> None:
         ]
         spread = pytest.approx(np.std(by_seed, ddof=1)) if len(seeds) > 1 else None
         assert row["accuracy_std_seeds"] == spread
-        for figure in ("eer", "auc", "d_prime"):
+        for figure in ("eer", "auc"):
             assert row[figure] == pytest.approx(np.mean([each[figure] for each in own]))
         at = row["fnmr_at_fmr"]["0.1"]
         errors = [each["fnmr_at_fmr"]["0.1"]["errors"] for each in own]
@@ -85,12 +84,11 @@ def test_a_set_without_folds_has_every_figure_but_the_accuracy() -> None:
     # The grid is a search for the accuracy: without folds it has nothing to choose.
     assert set(plain["threshold_search"]) == {"exact"}
     row, other = (
-        row_of(lines[lines["strategy"] == "random"][:1], trials, plan, Model(N, {}))
-        for lines in (plain, folded)
+        row_of(lines[lines["strategy"] == "random"][:1], trials, plan) for lines in (plain, folded)
     )
     missing = {name for name, value in row.items() if value is None}
     assert missing - {name for name, value in other.items() if value is None} == {
-        *("accuracy_mean", "accuracy_std", "threshold_mean", "thresholds"),
+        *("accuracy_mean", "accuracy_std", "threshold_mean"),
     }
     assert row["fnmr_at_fmr"] == other["fnmr_at_fmr"]
 
@@ -135,37 +133,6 @@ def test_a_template_is_the_mean_of_its_photos_that_were_acquired() -> None:
     np.testing.assert_allclose(means.embeddings[1:], photos[[3, 4]], atol=1e-6)
 
 
-def test_rates_with_failures_follow_the_standard() -> None:
-    plan = EvaluationPlan(("raw",), targets=(0.1,))
-    trials = replace(made_trials(named=False), fta=0.04)
-    row = row_of(run(plan, trials)[:1], trials, plan, Model(N, {}))
-    at = row["fnmr_at_fmr"]["0.1"]
-    assert at["interval"] == "pair-bootstrap"
-    assert at["far"] == pytest.approx(at["fmr"] * 0.96)
-    assert at["frr"] == pytest.approx(0.04 + at["value"] * 0.96)
-
-
-@pytest.mark.parametrize(
-    ("strategy", "dim", "entries", "expected"),
-    [
-        # By hand: with 1 decoy of 10, the second side draws the same with probability 1/10.
-        ("hybrid", 2, 10, 0.1),
-        # 1 - C(8, 2) / C(10, 2)
-        ("adversarial", 2, 10, 1 - 28 / 45),
-        ("random", 2, 10, 0.0),
-        # One of 16 parts of 10 entries each, and inside it as above.
-        ("sub-adversarial", 2, 160, (1 - 28 / 45) / 16),
-        ("hybrid+", 2, 10, None),
-    ],
-)
-def test_the_collision_floor(strategy: str, dim: int, entries: int, expected: float | None) -> None:
-    source = pool(entries, labelled=True)
-    names = {"strategy": strategy, "shared_decoys": True, "dim": dim}
-    floor = collision_floor(names, source)
-    assert floor == (None if expected is None else pytest.approx(expected))
-    assert collision_floor(names | {"shared_decoys": False}, source) == 0
-
-
 def written_out(known: Trials, runs: pd.DataFrame, fmr: float) -> tuple[float, float]:
     """95 % interval of the mean FNMR: trials repeated as often as they were drawn, run by run."""
     every = []
@@ -187,7 +154,7 @@ def written_out(known: Trials, runs: pd.DataFrame, fmr: float) -> tuple[float, f
 def test_intervals_are_those_of_replicates_written_out(named: bool) -> None:
     known = made_trials(people=40, pairs=400, named=named)
     runs = run(SPREAD, known)
-    at = row_of(runs, known, SPREAD, Model(N, {}))["fnmr_at_fmr"]["0.05"]
+    at = row_of(runs, known, SPREAD)["fnmr_at_fmr"]["0.05"]
     low, high = written_out(known, runs, 0.05)
     # Its own threshold in every replicate makes it much wider than the errors alone would.
     bounds = wilson(at["errors_mean"], 200)
