@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from models.alignment import align
 from models.cache import EmbeddingCache
 from models.decoding import DEFAULT_LIMITS, decode_image
 from models.errors import FaceError, ImageError
@@ -35,14 +34,10 @@ class Photo:
     ----------
     source
         The file, or the encoded photo itself.
-    keypoints : (5, 2) float64, optional
-        Left eye, right eye, nose, left and right mouth corner, in pixels, as seen in the picture:
-        the face is aligned by them where the pack has no detector.
     """
 
     name: str
     source: Path | bytes = field(repr=False)
-    keypoints: NDArray[np.float64] | None = field(default=None, repr=False, compare=False)
 
     def read(self) -> bytes:
         """Read the encoded photo; of a larger file one byte more than the decoder accepts."""
@@ -130,7 +125,6 @@ class Extractor:
         self._pack = pack
         self._cache = cache
         self._aligned = aligned or pack.info.detector is None
-        self._trusts_marks = not aligned and pack.info.detector is None
         # One kind of embedding, or the two kinds that are made together.
         self._kinds = tuple(
             self._settings_digest({**pack.info.preprocessing, "flip": flip})
@@ -219,18 +213,12 @@ class Extractor:
         try:
             data = photo.read()
             content = hashlib.sha256(data).digest()
-            marks = photo.keypoints if self._trusts_marks else None
-            if marks is not None:
-                content = hashlib.sha256(content + marks.tobytes()).digest()
             key = tuple(hashlib.sha256(kind + content).digest() for kind in self._kinds)
             known = () if self._cache is None else tuple(self._cache.get(part) for part in key)
             embeddings = tuple(embedding for embedding in known if embedding is not None)
             if len(embeddings) == len(key):
                 return _Prepared(key, embeddings=embeddings, is_cached=True)
-            if marks is not None:
-                image = decode_image(data)
-                crop = align(image, marks, size=self._pack.crop_size)
-            elif self._aligned:
+            if self._aligned:
                 crop = self._pack.as_aligned(decode_image(data))
             else:
                 crop = self._pack.crop_photo(data, policy=None, quality=None).crop

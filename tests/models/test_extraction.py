@@ -5,7 +5,6 @@ import pytest
 from PIL import Image
 
 from models import extraction
-from models.alignment import align, template
 from models.cache import EmbeddingCache
 from models.extraction import Extractor, Photo
 from models.pack import ModelPack
@@ -159,23 +158,3 @@ def test_encoded_photos_stand_under_their_names(pack, files):
     assert [(str(f.path), f.code) for f in result.failures] == [("bad", "unsupported_image")]
     np.testing.assert_array_equal(result.embeddings, Extractor(pack).extract(files).embeddings)
     assert "source" not in repr(photos[0])
-
-
-def test_a_marked_face_is_aligned_by_its_marks_where_there_is_no_detector(pack, tmp_path):
-    photo = np.random.default_rng(9).integers(0, 256, (150, 200, 3), dtype=np.uint8)
-    path = tmp_path / "photo.png"
-    Image.fromarray(photo).save(path)
-    marks = template(112) * 0.9 + [40.0, 20.0]
-    alone = pack.embed(align(photo, marks, size=112)[None])
-    for source in (path, path.read_bytes()):
-        cache = EmbeddingCache()
-        found = Extractor(pack, cache=cache).extract([Photo("photo", source, marks)])
-        np.testing.assert_allclose(found.embeddings, alone, atol=1e-6)
-        assert [path.stem for path in found.paths] == ["photo"]
-        # Other marks are another face, for the cache too.
-        again = Extractor(pack, cache=cache).extract([Photo("photo", source, marks + 5)])
-        assert again.cached == 0
-        assert not np.allclose(again.embeddings, alone, atol=1e-3)
-    # Said to be an aligned crop, it is taken as one: this one is not square.
-    told = Extractor(pack, aligned=True).extract([Photo("photo", path, marks)])
-    assert [failure.code for failure in told.failures] == ["unsupported_image"]

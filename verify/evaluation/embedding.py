@@ -149,8 +149,7 @@ class PackEmbedder:
         aligned = pairs.aligned if self.aligned is None else self.aligned
         if aligned is None:
             aligned = are_aligned(pairs, size)
-        marked = all(picture.keypoints is not None for picture in pairs.pictures)
-        if not aligned and not marked and self.pack.info.detector is None:
+        if not aligned and self.pack.info.detector is None:
             raise EvaluationError(
                 f"the pack has no detector, and the photos of {pairs.name} are not all crops of "
                 f"{size} x {size}: use a pack with a detector, or say that they are "

@@ -2,7 +2,6 @@
 
 import hashlib
 from collections import Counter, defaultdict
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,7 +17,7 @@ _SHOWN = 3
 _FLOATS = (np.dtype(np.float16), np.dtype(np.float32), np.dtype(np.float64))
 _KEYS = "expected arrays paths (unicode) and descriptors (float16, float32 or float64)"
 
-# Components at the end of a name that tell the photos of a kind apart, wherever they lie.
+# Components at the end of a name that tell the photos of a kind apart; all where it is absent.
 _TELLING = {"bin": 1, "lfw": 1, "agedb": 1, "cfp": 3}
 
 
@@ -103,10 +102,10 @@ def read_content(file: Path) -> EmbeddingsFile:
 def match(file: EmbeddingsFile, benchmark: VerificationSet) -> NDArray[np.int64]:
     """Find the embedding of every photo of a set.
 
-    A photo takes the row of its exact name; else of its name without suffix; else the row that
-    shares the longest end of its path: all of the shorter path, or as many components as tell
-    photos of the set apart (``Name_0001`` in LFW, ``001/frontal/01`` in CFP). Photos of a
-    ``.bin`` are ``00000``, ``00001`` … by place.
+    A photo takes the row of its exact name; else the row whose path ends, suffixes aside, in as
+    many components of its own as tell photos of the set apart (``Name_0001`` in LFW,
+    ``001/frontal/01`` in CFP, all of them in a pair CSV). Photos of a ``.bin`` are ``00000``,
+    ``00001`` … by place.
 
     Returns
     -------
@@ -116,29 +115,22 @@ def match(file: EmbeddingsFile, benchmark: VerificationSet) -> NDArray[np.int64]
     Raises
     ------
     DatasetError
-        Several rows fit a photo equally well, or one row fits several photos.
+        Several rows fit a photo.
     """
     exact = {path: [row] for row, path in enumerate(file.paths)}
     ends: defaultdict[tuple[str, ...], list[int]] = defaultdict(list)
-    whole: defaultdict[tuple[str, ...], list[int]] = defaultdict(list)
     for row, path in enumerate(file.paths):
         pieces = _components(path)
-        whole[pieces].append(row)
         for start in range(len(pieces)):
             ends[pieces[start:]].append(row)
-    telling = _TELLING.get(benchmark.kind)
+    telling = _TELLING.get(benchmark.kind, 0)
     positions = np.full(len(benchmark.pictures), -1, dtype=np.int64)
-    takers: dict[int, str] = {}
     faults: list[str] = []
     for place, picture in enumerate(benchmark.pictures):
-        name = picture.name
-        rows = exact.get(name) or _longest(_components(name), ends, whole, telling)
+        rows = exact.get(picture.name) or ends[_components(picture.name)[-telling:]]
         if len(rows) > 1:
             shown = " and ".join(f"{file.paths[row]!a}" for row in rows[:_SHOWN])
-            faults.append(f"{name} may be {shown}")
-        elif rows and takers.setdefault(rows[0], name) != name:
-            path = file.paths[rows[0]]
-            faults.append(f"{path!a} fits both {takers[rows[0]]} and {name}")
+            faults.append(f"{picture.name} may be {shown}")
         elif rows:
             positions[place] = rows[0]
     if faults:
@@ -146,21 +138,6 @@ def match(file: EmbeddingsFile, benchmark: VerificationSet) -> NDArray[np.int64]
             faults_in(Path(benchmark.name), "expected one embedding for each photo", faults)
         )
     return positions
-
-
-_Rows = Mapping[tuple[str, ...], list[int]]
-
-
-def _longest(wanted: tuple[str, ...], ends: _Rows, whole: _Rows, telling: int | None) -> list[int]:
-    """Rows that share the longest end with a path, of which that end is all, or enough to tell."""
-    for start in range(len(wanted)):
-        end = wanted[start:]
-        tells = telling is not None and len(end) >= telling
-        rows = whole.get(end) if start == 0 or not tells else None
-        rows = rows or (ends.get(end) if start == 0 or tells else None)
-        if rows:
-            return rows
-    return []
 
 
 def _components(path: str) -> tuple[str, ...]:

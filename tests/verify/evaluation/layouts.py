@@ -47,19 +47,14 @@ def lfw_folder(root: Path, *, inside: str = "", suffix: str = ".jpg", photos: bo
 CFP_IDENTITIES = ("001", "002", "003")
 
 
-def cfp_folder(
-    root: Path, *, images: Sequence[str] = ("Data/Images",), photos: bool = True
-) -> Path:
-    """Three identities with 2 frontal and 2 profile photos; identity k lies in ``images[k % …]``.
-
-    Every fold has two genuine and two impostor pairs.
-    """
+def cfp_folder(root: Path, *, photos: bool = True) -> Path:
+    """Three identities with 2 frontal and 2 profile photos, two pairs of each kind in a fold."""
     for letter, pose in (("F", "frontal"), ("P", "profile")):
         paths = [f"{who}/{pose}/{n:02d}.jpg" for who in CFP_IDENTITIES for n in (1, 2)]
         lines = [f"{i} ../Data/Images/{path}" for i, path in enumerate(paths, start=1)]
         write(root / f"Protocol/Pair_list_{letter}.txt", "\n".join(lines) + "\n")
         for number, path in enumerate(paths if photos else ()):
-            write(root / images[(number // 2) % len(images)] / path, drawn(ord(letter) + number))
+            write(root / "Data/Images" / path, drawn(ord(letter) + number))
     for split in ("FF", "FP"):
         for fold in range(1, FOLDS + 1):
             folder = root / "Protocol" / "Split" / split / f"{fold:02d}"
@@ -106,7 +101,7 @@ def agedb_folder(
     compressed: bool = True,
     photos: bool = True,
 ) -> Path:
-    """Three photos of two people, with landmarks, and three pairs a fold."""
+    """Three photos of two people, and three pairs a fold."""
     folds = agedb_folds() if folds is None else folds
     root.mkdir(parents=True, exist_ok=True)
     scipy.io.savemat(
@@ -114,9 +109,6 @@ def agedb_folder(
         {"splits": agedb_splits(layout, folds)},
         do_compression=compressed,
     )
-    points = "".join(f"{i}.5 {2 * i}\n" for i in range(68))
     for number, name in enumerate(AGEDB_NAMES if photos else ()):
         write(root / "03_Protocol_Images" / f"{name}.jpg", drawn(number))
-        text = f"version: 1\nn_points: 68\n{{\n{points}}}\n"
-        write(root / "03_Protocol_Images" / f"{name}.pts", text)
     return root

@@ -8,8 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from models.extraction import Photo
 from tests.verify.evaluation.layouts import write
@@ -129,8 +127,6 @@ NAMES = ["Ann/Ann_0001.jpg", "Ann/Ann_0002.jpg", "Bob/Bob_0001.jpg"]
         (["./Ann_0001.jpg", "crops/Ann_0002.npy.jpg", "other/Bob_0001.jpg"], [0, -1, 2]),
         # The exact name wins over another file with the same end.
         (["old/Ann/Ann_0001.jpg", "Ann/Ann_0001.jpg"], [1, -1, -1]),
-        # So does the longer common end.
-        (["/x/Eve/Ann_0001.jpg", "/x/Ann/Ann_0001.jpg"], [1, -1, -1]),
         ([], [-1, -1, -1]),
     ],
 )
@@ -143,49 +139,12 @@ def test_lfw_names(paths: list[str], expected: list[int]) -> None:
     [
         ("lfw", NAMES, ["x/Ann/Ann_0001.jpg", "y/Ann/Ann_0001.jpg"], "Ann_0001.jpg may be 'x/Ann"),
         ("lfw", NAMES, ["Ann/Ann_0001.png", "Ann/Ann_0001.webp"], "Ann_0001.jpg may be"),
-        ("pairs", ["a/1.jpg", "b/1.jpg"], ["1.jpg"], "'1.jpg' fits both a/1.jpg and b/1.jpg"),
+        ("pairs", ["a/1.jpg"], ["x/a/1.jpg", "y/a/1.jpg"], "a/1.jpg may be 'x/a/1.jpg' and"),
     ],
 )
 def test_ambiguous_names(kind: str, names: list[str], paths: list[str], message: str) -> None:
     with pytest.raises(DatasetError, match=message):
         match(embeddings(paths), benchmark(kind, names))
-
-
-def slow_longest(wanted: str, paths: Sequence[str], telling: int | None) -> list[int]:
-    """By comparing every path from its end, component by component."""
-    mine, best = wanted.removesuffix(".jpg").split("/"), {}
-    for row, path in enumerate(paths):
-        theirs = path.removesuffix(".jpg").split("/")
-        if theirs == mine:
-            best.setdefault(99, []).append(row)
-        shared = 0
-        while shared < min(len(mine), len(theirs)) and mine[-1 - shared] == theirs[-1 - shared]:
-            shared += 1
-        if shared and (
-            shared in (len(mine), len(theirs)) or (telling is not None and shared >= telling)
-        ):
-            best.setdefault(shared, []).append(row)
-    return best[max(best)] if best else []
-
-
-@pytest.mark.parametrize(("kind", "telling"), [("lfw", 1), ("cfp", 3), ("pairs", None)])
-@given(
-    st.lists(st.lists(st.sampled_from("abc"), min_size=1, max_size=5), max_size=6, unique_by=tuple),
-    st.lists(st.sampled_from("abc"), min_size=1, max_size=4),
-)
-@settings(max_examples=60)
-def test_the_longest_end_is_that_of_a_slow_search(
-    kind: str, telling: int | None, paths: list[list[str]], wanted: list[str]
-) -> None:
-    names = [f"{'/'.join(path)}.jpg" for path in paths]
-    name = "/".join(wanted) + ".jpg"
-    expected = [names.index(name)] if name in names else slow_longest(name, names, telling)
-    one = benchmark(kind, [name])
-    if len(expected) > 1:
-        with pytest.raises(DatasetError, match="may be"):
-            match(embeddings(names), one)
-    else:
-        np.testing.assert_array_equal(match(embeddings(names), one), expected or [-1])
 
 
 def test_a_photo_of_another_person_is_never_taken() -> None:

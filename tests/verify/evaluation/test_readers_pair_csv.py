@@ -73,9 +73,8 @@ def test_folds(tmp_path: Path, start: int) -> None:
 @pytest.mark.parametrize(
     ("folds", "message"),
     [
-        (range(11), "both 0 and 10"),
-        (range(1, 10), "neither 0 nor 10"),
-        ([*range(5), 9, 0], "fold 6 has no genuine and no impostor pair"),
+        (range(11), "has 11 folds; number ten"),
+        (range(1, 10), "has 9 folds; number ten"),
         ([11, 0], "line 2 has no fold of 1 to 10"),
         (["x", 0], "line 2 has no fold"),
     ],
@@ -103,8 +102,6 @@ def test_people(tmp_path: Path) -> None:
     ("text", "message"),
     [
         (table(HEADER, "a,b,perhaps", OTHER), "line 2 has neither 1/true/yes"),
-        (table(HEADER, "https://x.org/a.png,b,1", OTHER), "line 2 has a URL in path_a"),
-        (table(HEADER, "a,file:///b,1", OTHER), "line 2 has a URL in path_b"),
         (table(HEADER, ",b,1", OTHER), "line 2 has no path in path_a"),
         (table(HEADER, "a\0,b,1", OTHER), "line 2 has no path in path_a"),
         (table(HEADER, "a,b", OTHER), "line 2 has 2 cells, not 3"),
@@ -150,11 +147,7 @@ def test_a_file_that_is_not_utf_8(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "name",
-    [
-        *("=SUM(A1)", "+1", "-1", "@x", "a[1]", "a]b", "$x$", "a|b", "a`b"),
-        *("a\nb", "a\x1b[31m", "a\u202eb", "a\udcff", "x" * 101),
-    ],
+    "name", ["=SUM(A1)", "-1", "a[1]", "a|b", "a\x1b[31m", "a\udcff", "x" * 101]
 )
 def test_a_name_that_means_something_elsewhere_is_refused(tmp_path: Path, name: str) -> None:
     file = write(tmp_path / f"{name}.csv", table(HEADER, "a,b,1", "a,c,0"))

@@ -1,15 +1,14 @@
-"""The AgeDB-30 folder: the protocol of 30 years' difference, photos and their landmarks."""
+"""The AgeDB-30 folder: the protocol of 30 years' difference, and its photos."""
 
 import io
-from collections.abc import Callable, Sequence
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from models.extraction import Photo
-from verify.datasets import SUFFIXES, DatasetError, Trial, faults_in, read_whole
+from verify.datasets import SUFFIXES, DatasetError, Trial, read_whole
 from verify.evaluation.readers.reader import (
     Reader,
     assemble,
@@ -24,23 +23,12 @@ from verify.tenfold import FOLDS
 PROTOCOL = "04_FINAL_protocol_30_years.mat"
 PHOTOS = "03_Protocol_Images"
 _MAX_MAT_BYTES = 16 * 2**20
-_POINTS = 68
-_MAX_PTS_BYTES = 2**16
-_TOLERATED = 0.01
+# The person of "11_AlexKingston_35_f".
+_PERSON = re.compile(r"\d+_(.+?)_\d")
 
 
 def read_agedb(root: Path, pictures: bool) -> list[VerificationSet]:
     """Read ``04_FINAL_protocol_30_years.mat`` and find its photos in ``03_Protocol_Images/``.
-
-    The person is read off the file name: of ``11_AlexKingston_35_f`` the words before the first
-    number after the index, or of names with an identity in front that identity; whichever
-    agrees with the labels of more pairs.
-
-    Raises
-    ------
-    DatasetError
-        The protocol has another layout, photos are absent (all listed), or the names of the
-        people contradict more than one label in a hundred, as shuffled labels would.
 
     References
     ----------
@@ -54,17 +42,15 @@ def read_agedb(root: Path, pictures: bool) -> list[VerificationSet]:
         # Archives are often unpacked into a folder of their own name.
         inner = root / PHOTOS / PHOTOS
         base = inner if inner.is_dir() else root / PHOTOS
-        for key, photo in photos_named(base, keys, protocol=PROTOCOL).items():
-            points = photo.with_suffix(".pts")
-            marks = read_pts(points) if points.is_file() else None
-            files[key] = Photo(photo.name, photo, marks)
+        found = photos_named(base, keys, protocol=PROTOCOL)
+        files = {key: Photo(photo.name, photo) for key, photo in found.items()}
     return [
         assemble(
             "agedb_30",
             "agedb",
             trials,
             pictures=files,
-            person=_person_rule(root / PROTOCOL, trials),
+            person=_person,
             protocol_files=[(PROTOCOL, sha256)],
         )
     ]
@@ -76,11 +62,6 @@ def read_content(file: Path) -> tuple[list[Trial], str]:
     ``splits`` holds ten folds. A fold is a struct, or a cell, of a 2 × P cell of photos and of P
     labels, 1 and −1 (or 0). A photo is the name of its file without suffix, or a struct of which
     that is the first field.
-
-    Raises
-    ------
-    DatasetError
-        The file is not of version 5 to 7, holds no ``splits``, or another layout.
     """
     from scipy.io import loadmat
 
@@ -96,14 +77,21 @@ def read_content(file: Path) -> tuple[list[Trial], str]:
         raise
     except Exception as error:  # SciPy raises whatever a broken file causes
         raise DatasetError(f"{file} is cut off or damaged ({type(error).__name__})") from None
-    if "splits" not in content:
-        raise DatasetError(f"{file} holds no variable named splits")
-    if np.shape(content["splits"]) != (FOLDS,):
-        raise DatasetError(f"{file}: splits is not a list of {FOLDS} folds")
+    splits = content.get("splits", ())
+    if np.shape(splits) != (FOLDS,):
+        raise DatasetError(f"{file} holds no list of {FOLDS} folds named splits")
     trials: list[Trial] = []
-    for fold, part in enumerate(content["splits"]):
+    for fold, part in enumerate(splits):
         try:
-            trials += _fold(part, fold)
+            pairs, labels = _members(part)
+            first, second = ([_name(photo) for photo in row] for row in pairs)
+            same = np.ravel(labels).tolist()
+            if set(same) not in ({1, -1}, {1, 0}):
+                raise ValueError("it has other labels, or labels of one kind")
+            trials += [
+                Trial(one, other, label == 1, fold)
+                for one, other, label in zip(first, second, same, strict=True)
+            ]
         except (TypeError, ValueError) as error:
             raise DatasetError(
                 f"{file}: fold {fold + 1} is not a 2 × P cell of names and P labels of 1 and −1: "
@@ -112,94 +100,27 @@ def read_content(file: Path) -> tuple[list[Trial], str]:
     return trials, digest_of(data)
 
 
-def _fold(part: Any, fold: int) -> list[Trial]:
-    pairs, labels = _parts(part)
-    first, second = ([_name(photo) for photo in row] for row in pairs)
-    labels = np.ravel(labels)
-    if set(labels.tolist()) not in ({1, -1}, {1, 0}):
-        raise ValueError("it has other labels, or labels of one kind")
-    return [
-        Trial(one, other, label == 1, fold)
-        for one, other, label in zip(first, second, labels.tolist(), strict=True)
-    ]
-
-
-def _parts(value: Any) -> list[Any]:
+def _members(value: Any) -> list[Any]:
     """Return the fields of a struct, or the elements of a cell."""
     if not isinstance(value, np.ndarray | np.void):
         raise TypeError("it is neither a struct nor a cell")
     if not value.dtype.names:
         return list(np.asarray(value))
     fields = [value[name] for name in value.dtype.names]
-    return [
-        field.item() if isinstance(field, np.ndarray) and not field.shape else field
-        for field in fields
-    ]
+    return [one.item() if isinstance(one, np.ndarray) and not one.shape else one for one in fields]
 
 
 def _name(photo: Any) -> str:
-    name = photo if isinstance(photo, str) else next(iter(_parts(photo)), None)
+    name = photo if isinstance(photo, str) else next(iter(_members(photo)), None)
     if not isinstance(name, str) or not name.strip():
         raise ValueError("it has a photo without a name")
     path = Path(name.strip())
     return str(path.with_suffix("")) if path.suffix.lower() in SUFFIXES else name.strip()
 
 
-def read_pts(file: Path) -> NDArray[np.float64]:
-    """Read five landmarks from a 68-point ``.pts`` file.
-
-    Returns
-    -------
-    points : (5, 2) float64
-        x and y in pixels, as written: left eye (mean of points 36 and 39, counted from 0), right
-        eye (42 and 45), nose (33), left and right mouth corner (48 and 54), left and right as
-        seen in the picture.
-
-    Raises
-    ------
-    DatasetError
-        The file does not hold 68 finite points between braces.
-
-    References
-    ----------
-    Sagonas et al., "300 Faces in-the-Wild Challenge", ICCVW 2013: the 68 points and the format.
-    """
-    text = read_whole(file, most=_MAX_PTS_BYTES).decode("ascii", "replace")
-    body = text.partition("{")[2].partition("}")[0]
-    try:
-        points = np.array([line.split() for line in body.splitlines() if line.strip()], np.float64)
-    except ValueError:
-        points = np.empty((0, 2))
-    if points.shape != (_POINTS, 2) or not np.isfinite(points).all() or not np.ptp(points):
-        raise DatasetError(f"{file} does not hold {_POINTS} points in braces, not all equal")
-    eyes = (points[36] + points[39]) / 2, (points[42] + points[45]) / 2
-    return np.stack([*eyes, points[33], points[48], points[54]])
-
-
-def _identity(key: str) -> str:
-    return key.split("_")[0]
-
-
-def _words(key: str) -> str:
-    parts = key.split("_")[1:]
-    number = next((place for place, part in enumerate(parts) if part.isdecimal()), len(parts))
-    return "_".join(parts[:number]) or key
-
-
-def _person_rule(file: Path, trials: Sequence[Trial]) -> Callable[[str], str]:
-    def contradictions(person: Callable[[str], str]) -> list[Trial]:
-        return [one for one in trials if (person(one.first) == person(one.second)) != one.same]
-
-    rule = min((_words, _identity), key=lambda person: len(contradictions(person)))
-    wrong = contradictions(rule)
-    if len(wrong) > _TOLERATED * len(trials):
-        faults = [
-            f"fold {(one.fold or 0) + 1} has {one.first} and {one.second} as "
-            f"{'one person' if one.same else 'two people'}"
-            for one in wrong
-        ]
-        raise DatasetError(faults_in(file, "expected labels that agree with the names", faults))
-    return rule
+def _person(key: str) -> str:
+    match = _PERSON.match(key)
+    return match[1] if match else key
 
 
 READER = Reader(

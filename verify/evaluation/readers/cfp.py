@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from models.extraction import Photo
-from verify.datasets import DatasetError, Trial, faults_in, is_photo
+from verify.datasets import DatasetError, Trial, faults_in
 from verify.evaluation.readers.reader import (
     ProtocolText,
     Reader,
@@ -25,14 +25,7 @@ def read_cfp(root: Path, pictures: bool) -> list[VerificationSet]:
 
     ``Protocol/Pair_list_F.txt`` and ``Pair_list_P.txt`` number the photos from 1, with paths
     relative to ``Protocol/``; ``Protocol/Split/FF|FP/01 … 10/same.txt|diff.txt`` hold ``i,j``
-    lines. In FP, i indexes F and j indexes P. A photo that is not at the protocol's path is
-    looked for by ``identity/pose/number`` below the root, as in copies that split the identities
-    into ``train/`` and ``test/``.
-
-    Raises
-    ------
-    DatasetError
-        Naming the first broken line, or listing every photo that is absent or found twice.
+    lines. In FP, i indexes F and j indexes P.
 
     References
     ----------
@@ -42,13 +35,15 @@ def read_cfp(root: Path, pictures: bool) -> list[VerificationSet]:
     lists = {letter: _photo_list(text, letter) for letter, text in texts.items()}
     protocols = {split: _trials(root, split, lists) for split in ("FF", "FP")}
     keys = keys_of(trial for trials, _ in protocols.values() for trial in trials)
-    files = _files(root, keys) if pictures else {key: Photo(key, root / key) for key in keys}
+    absent = [f"{key} is not there" for key in keys if pictures and not (root / key).is_file()]
+    if absent:
+        raise DatasetError(faults_in(root, "expected each photo of the protocol", absent))
     return [
         assemble(
             f"cfp_{split.lower()}",
             "cfp",
             trials,
-            pictures=files,
+            pictures=lambda key: Photo(key, root / key),
             person=_identity,
             protocol_files=[
                 *(texts[letter].fingerprint for letter in sorted(set(split))),
@@ -69,19 +64,16 @@ def _photo_list(text: ProtocolText, letter: str) -> list[str]:
     for number, line in enumerate(text.text.splitlines(), start=1):
         if not line.strip():
             continue
-        where = f"{text.name} line {number}"
-        index, written = line.split(None, 1) if len(line.split(None, 1)) == 2 else ("", "")
+        index, written = (*line.split(None, 1), "")[:2]
         path = posixpath.normpath(posixpath.join("Protocol", written.strip().replace("\\", "/")))
         parts = path.split("/")
-        if not written or not index.isdecimal() or not path.isprintable():
-            raise DatasetError(f"{where} is not of the form: index path")
-        if len(parts) < 3 or parts[-2] != _POSES[letter] or path[0] == "/" or parts[0] == "..":
+        is_photo = len(parts) > 2 and parts[-2] == _POSES[letter] and parts[0] not in ("", "..")
+        if index != str(len(photos) + 1) or not is_photo or not path.isprintable():
             raise DatasetError(
-                f"{where} names no photo of the form identity/{_POSES[letter]}/photo"
+                f"{text.name} line {number} is not of the form: {len(photos) + 1} "
+                f"…/identity/{_POSES[letter]}/photo"
             )
         photos.append(path)
-        if index != str(len(photos)):
-            raise DatasetError(f"{where} has the index {index[:20]} where {len(photos)} follows")
     if not photos:
         raise DatasetError(f"{text.name} lists no photo")
     return photos
@@ -116,29 +108,6 @@ def _pair(where: str, line: str, photos: Sequence[Sequence[str]]) -> list[str]:
         if not 1 <= int(index) <= len(side):
             raise DatasetError(f"{where} has the index {index}; its list has 1 to {len(side)}")
     return [side[int(index) - 1] for index, side in zip(indices, photos, strict=True)]
-
-
-def _files(root: Path, keys: Sequence[str]) -> dict[str, Photo]:
-    files = {key: Photo(key, root / key) for key in keys if (root / key).is_file()}
-    if len(files) == len(keys):
-        return files
-    elsewhere: dict[tuple[str, ...], list[str]] = {}
-    for photo in sorted(root.rglob("*/*/*")):
-        if is_photo(photo):
-            name = photo.relative_to(root)
-            elsewhere.setdefault(name.parts[-3:], []).append(name.as_posix())
-    faults = []
-    for key in keys:
-        names = [key] if key in files else elsewhere.get(tuple(key.split("/")[-3:]), [])
-        if len(names) == 1:
-            files[key] = Photo(names[0], root / names[0])
-        else:
-            faults.append(f"{key} may be {' or '.join(names)}" if names else f"{key} is not there")
-    if faults:
-        raise DatasetError(
-            faults_in(root, "expected each photo of the protocol once below it", faults)
-        )
-    return files
 
 
 READER = Reader(

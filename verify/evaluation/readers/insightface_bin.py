@@ -29,10 +29,7 @@ def read_bin(path: Path, _: bool) -> list[VerificationSet]:
     array of objects instead of a list. Equal contents are one photo, named by the place of its
     first use in ``bins``.
 
-    Raises
-    ------
-    DatasetError
-        Naming what is wrong. Nothing in the file is run, whatever it holds.
+    Nothing in the file is run, whatever it holds.
     """
     photos, same, sha256 = isolated(read_content, path)
     name_of: dict[bytes, str] = {}
@@ -57,13 +54,7 @@ def read_bin(path: Path, _: bool) -> list[VerificationSet]:
 
 
 def read_content(path: Path) -> tuple[list[bytes], list[bool], str]:
-    """Return the photos, the answers and the SHA-256 of a file.
-
-    Raises
-    ------
-    DatasetError
-        As of :func:`read_bin`.
-    """
+    """Return the photos, the answers and the SHA-256 of a file."""
     data = read_whole(path, most=MAX_BIN_BYTES)
     stream = io.BytesIO(data)
     try:
@@ -72,7 +63,7 @@ def read_content(path: Path) -> tuple[list[bytes], list[bool], str]:
             raise pickle.UnpicklingError(f"{rest} bytes follow its end")
         if not isinstance(content, tuple | list) or len(content) != 2:
             raise DatasetError(f"{path} does not hold the two parts (bins, issame_list)")
-        bins, answers = (part.values() if isinstance(part, _Array) else part for part in content)
+        bins, answers = (part.listed() if isinstance(part, _Array) else part for part in content)
     except (DatasetError, MemoryError):
         raise
     except pickle.UnpicklingError as error:
@@ -88,7 +79,7 @@ def read_content(path: Path) -> tuple[list[bytes], list[bool], str]:
             f"{path} has {len(bins)} photos and {len(answers)} answers; a pair needs two photos"
         )
     for place, answer in enumerate(answers):
-        if not isinstance(answer, int) or answer not in (0, 1):
+        if not isinstance(answer, int | np.integer | np.bool_) or answer not in (0, 1):
             raise DatasetError(f"{path}: answer {place} is neither true nor false")
     photos = [_photo(path, place, element) for place, element in enumerate(bins)]
     return photos, [bool(answer) for answer in answers], digest_of(data)
@@ -104,57 +95,41 @@ def _photo(path: Path, place: int, element: object) -> bytes:
     return bytes(element)
 
 
-def _text(value: Any) -> str:
-    """Return text, which is bytes where Python 2 wrote it."""
-    return str(value, "latin-1") if isinstance(value, bytes) else str(value)
-
-
 class _Type:
-    """Stands for ``numpy.dtype``."""
+    """Stands for ``numpy.dtype``; the state that a pickle gives it is its byte order."""
 
     def __init__(self, code: Any, *_: object) -> None:
-        self.code = _text(code)
+        self.code = code.decode() if isinstance(code, bytes) else str(code)
 
     def __setstate__(self, state: Any) -> None:
-        self.code = _text(state[1]).replace("|", "") + self.code
-
-    def numbers(self, raw: bytes) -> list[Any]:
-        """Return the numbers of which these are the bytes."""
-        numbers: list[Any] = np.frombuffer(raw, self.code).tolist()
-        return numbers
+        if state[1] in (">", b">"):
+            self.code = f">{self.code}"
 
 
 class _Array:
     """Stands for an array: NumPy's own trusts the state that a pickle gives it."""
 
     def __init__(self, *_: object) -> None:
-        self.state: Any = (1, (0,), _Type("O8"), False, [])
+        self.shape: Any = (0,)
+        self.values: Any = []
 
     def __setstate__(self, state: Any) -> None:
-        match state:
-            case (_, tuple(), _Type(), _, bytes() | list()):
-                self.state = state
-            case _:
-                raise pickle.UnpicklingError("an array's shape, type and content are not given")
+        _, self.shape, kind, _, content = state
+        self.values = content if isinstance(content, list) else np.frombuffer(content, kind.code)
 
-    def values(self) -> list[Any] | None:
+    def listed(self) -> list[Any] | None:
         """Return the elements of an array of one dimension."""
-        _, shape, kind, _, content = self.state
-        if len(shape) != 1 or isinstance(content, list):
-            return content if isinstance(content, list) else None
-        numbers: list[Any] = kind.numbers(content)
-        return numbers
+        return list(self.values) if len(self.shape) == 1 else None
 
     def row(self) -> bytes | None:
         """Return the bytes of a row, or a column, of uint8."""
-        _, shape, kind, _, content = self.state
-        is_row = kind.code == "u1" and max(shape, default=0) == len(content)
-        return content if is_row else None
+        is_row = isinstance(self.values, np.ndarray) and self.values.dtype == np.uint8
+        return self.values.tobytes() if is_row and max(self.shape) == len(self.values) else None
 
 
 def _filled(raw: bytes, kind: _Type, shape: Any, _: Any) -> _Array:
     array = _Array()
-    array.state = (1, shape, kind, False, raw)
+    array.__setstate__((1, shape, kind, False, raw))
     return array
 
 
@@ -172,7 +147,7 @@ _ALLOWED: dict[str, Any] = {
 for _core in ("numpy.core", "numpy._core"):
     _ALLOWED |= {
         f"{_core}.multiarray._reconstruct": _Array,
-        f"{_core}.multiarray.scalar": lambda kind, raw: kind.numbers(raw)[0],
+        f"{_core}.multiarray.scalar": lambda kind, raw: np.frombuffer(raw, kind.code)[0],
         f"{_core}.numeric._frombuffer": _filled,
     }
 

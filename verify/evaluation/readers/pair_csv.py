@@ -2,8 +2,8 @@
 
 import csv
 import os.path
-import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from models.extraction import Photo
@@ -15,7 +15,6 @@ from verify.tenfold import FOLDS
 REQUIRED = ("path_a", "path_b", "same")
 _PEOPLE = ("person_a", "person_b")
 _ANSWERS = {"1": True, "true": True, "yes": True, "0": False, "false": False, "no": False}
-_URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://")
 
 
 def read_pair_csv(path: Path, pictures: bool) -> list[VerificationSet]:
@@ -24,11 +23,6 @@ def read_pair_csv(path: Path, pictures: bool) -> list[VerificationSet]:
     Paths are relative to the file's folder, or absolute. A path of a folder is a template of all
     photos in it, whose embeddings are averaged. ``same`` is 1, true or yes, or 0, false or no.
     Folds are 1 … 10 or 0 … 9; without the column the set has none, and so no accuracy.
-
-    Raises
-    ------
-    DatasetError
-        Naming the first faulty line, or listing every photo that is absent.
     """
     text = read_text(path, root=path.parent)
     names: dict[str, str] = {}
@@ -85,8 +79,6 @@ def _fault_of(row: dict[str, str]) -> str | None:
     for column in ("path_a", "path_b"):
         if not row[column] or not row[column].isprintable():
             return f"has no path in {column}"
-        if _URL.match(row[column]):
-            return f"has a URL in {column}; photos are read from disk only"
     if row["same"].lower() not in _ANSWERS:
         return "has neither 1/true/yes nor 0/false/no in same"
     fold = row.get("fold", "0")
@@ -100,17 +92,12 @@ def _fault_of(row: dict[str, str]) -> str | None:
 
 def _from_zero(path: Path, trials: Sequence[Trial]) -> list[Trial]:
     """Number the folds from 0."""
-    folds = {trial.fold for trial in trials}
-    if folds == {None}:
-        return list(trials)
-    if (0 in folds) == (FOLDS in folds):
-        seen = "both 0 and 10" if 0 in folds else "neither 0 nor 10"
-        raise DatasetError(
-            f"{path} has {seen} in the column fold; number the ten folds 1 to 10, or 0 to 9"
-        )
-    start = int(FOLDS in folds)
+    folds = sorted({trial.fold for trial in trials if trial.fold is not None})
+    if folds and len(folds) != FOLDS:
+        raise DatasetError(f"{path} has {len(folds)} folds; number ten of them 1 to 10, or 0 to 9")
     return [
-        Trial(trial.first, trial.second, trial.same, (trial.fold or 0) - start) for trial in trials
+        replace(trial, fold=None if trial.fold is None else folds.index(trial.fold))
+        for trial in trials
     ]
 
 

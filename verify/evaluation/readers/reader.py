@@ -4,6 +4,7 @@ A reader is a module of this package with a ``READER``: how a data set looks, ho
 and a function from its path to verification sets. Modules are found by being there.
 """
 
+import re
 import resource
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -36,10 +37,8 @@ T = TypeVar("T")
 MEMORY_BYTES = 8 * 2**30
 """Four times the largest file that is read, beyond what the libraries of the process take."""
 
-_LONGEST_NAME = 100
-# A spreadsheet runs a cell that begins so; Markdown, tables and figures have meanings for the rest.
-_FORMULAS = ("=", "+", "-", "@")
-_MARKUP = frozenset("[]$|`")
+# Of a set: it stands in tables, figures and on the terminal.
+_NAME = re.compile(r"\w[\w .()-]{0,99}")
 
 
 @dataclass(frozen=True)
@@ -77,26 +76,14 @@ class ProtocolText:
 
 
 def read_text(file: Path, *, root: Path) -> ProtocolText:
-    """Read UTF-8 text, with or without a byte-order mark.
-
-    Raises
-    ------
-    DatasetError
-        The file is absent, too large or not UTF-8.
-    """
+    """Read UTF-8 text, with or without a byte-order mark."""
     data = read_whole(file, most=MAX_PAIRS_BYTES)
     name = file.relative_to(root).as_posix()
     return ProtocolText(name, digest_of(data), decoded(data, file=file))
 
 
 def isolated(read: Callable[[Path], T], file: Path) -> T:
-    """Read a file of a format that can ask for any memory, in a process that gets little.
-
-    Raises
-    ------
-    DatasetError
-        That of ``read``; or the process ran out of memory, or crashed.
-    """
+    """Read a file of a format that can ask for any memory, in a process that gets little."""
     with ProcessPoolExecutor(
         1, get_context("spawn"), initializer=_limit_memory, initargs=(MEMORY_BYTES,)
     ) as child:
@@ -122,13 +109,7 @@ def keys_of(trials: Iterable[Trial]) -> list[str]:
 
 
 def photos_named(base: Path, keys: Sequence[str], *, protocol: str) -> dict[str, Path]:
-    """Find the one photo of each key, which is its path below ``base`` without the suffix.
-
-    Raises
-    ------
-    DatasetError
-        Listing the photos that are absent, or there with several suffixes.
-    """
+    """Find the one photo of each key, which is its path below ``base`` without the suffix."""
     listed: dict[Path, dict[str, list[Path]]] = {}
     photos: dict[str, Path] = {}
     faults: list[str] = []
@@ -155,13 +136,7 @@ def photos_named(base: Path, keys: Sequence[str], *, protocol: str) -> dict[str,
 
 
 def require_plain_names(file: Path, names: Iterable[str]) -> None:
-    """Refuse names that lead out of the folder of the photos.
-
-    Raises
-    ------
-    DatasetError
-        Listing them.
-    """
+    """Refuse names that lead out of the folder of the photos."""
     unsafe = sorted(
         f"{name!a}"
         for name in set(names)
@@ -190,14 +165,12 @@ def assemble(
         The photo of a key, and the name of the person on it.
     templates
         Photos of the keys that stand for several.
-
-    Raises
-    ------
-    DatasetError
-        A fold lacks genuine or impostor pairs, or a name cannot stand in tables and figures.
     """
-    protocol_files = tuple(protocol_files)
-    _require_plain(name, [file for file, _ in protocol_files])
+    if not _NAME.fullmatch(name):
+        raise DatasetError(
+            f"the set {name[:100]!a} has a name of more than 100 characters, or of others than "
+            "letters, digits, spaces and _ . ( ) -; rename the file"
+        )
     keys = keys_of(trials)
     position = {key: place for place, key in enumerate(keys)}
     same = np.array([trial.same for trial in trials], dtype=np.bool_)
@@ -221,23 +194,7 @@ def assemble(
         same=same,
         folds=folds,
         people=None if person is None else tuple(person(key) for key in keys),
-        protocol_files=protocol_files,
+        protocol_files=tuple(protocol_files),
         aligned=aligned,
         templates=tuple(members) if templates else None,
     )
-
-
-def _require_plain(name: str, files: Sequence[str]) -> None:
-    """Refuse a name that would mean something in CSV, Markdown, a figure or the terminal."""
-    # What is printable can be encoded: halves of surrogate pairs are not.
-    wrong = next((text for text in (name, *files) if not text.isprintable()), None)
-    if wrong is None and (
-        len(name) > _LONGEST_NAME or name.startswith(_FORMULAS) or _MARKUP & set(name)
-    ):
-        wrong = name
-    if wrong is not None:
-        raise DatasetError(
-            f"the set {wrong[:_LONGEST_NAME]!a} has a name that is longer than {_LONGEST_NAME} "
-            f"characters, not printable, begins with one of {' '.join(_FORMULAS)}, or holds one of "
-            f"{' '.join(sorted(_MARKUP))}; rename the file"
-        )
