@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from models.decoding import DEFAULT_LIMITS, ImageLimits
 from models.pack import ModelPack
-from models.photos import embed_photos
 from models.quality import DEFAULT_QUALITY, QualityLimits
 from models.selection import FacePolicy
 from templates.contract import wire
@@ -37,15 +36,7 @@ WIRE_DTYPE: wire.WireDtype = "float16"
 
 @dataclass(frozen=True)
 class Holder:
-    """A person who keeps a key for an enrollment.
-
-    Parameters
-    ----------
-    key
-        32 secret bytes without which the template accepts nobody; it is not kept.
-    tenant, subject
-        Whom it is kept for.
-    """
+    """A person who keeps a key, without which the enrollment's template accepts nobody."""
 
     key: HolderKey = field(repr=False)
     tenant: str
@@ -69,16 +60,13 @@ class Enrollment:
     wire
         Rotated template in the wire format. Private: to be sealed, never logged.
     template_id
-        Random name of this template, 32 hexadecimal digits; its rotation is derived from it.
-    contract_id
-        Contract that the template belongs to.
+        Random, 32 hexadecimal digits; its rotation is derived from it.
     per_photo
         One result per photo; empty for a client's template.
     photos
         How many different photos were averaged: one that is given twice counts once.
     holder_salt
-        Random; the holder's rotation is derived from it and the holder's key. None where the
-        template needs no key.
+        The holder's rotation is derived from it and their key. None where it needs no key.
     """
 
     wire: bytes = field(repr=False)
@@ -94,10 +82,8 @@ class Enroller:
 
     Parameters
     ----------
-    contract
-        Contract that the templates will carry.
     source
-        Decoy source; its id must be the contract's.
+        The contract's decoys.
     rotation
         What gives each template of the tenant its rotation.
     lift_secret
@@ -140,13 +126,7 @@ class Enroller:
         quality: QualityLimits | None = DEFAULT_QUALITY,
         limits: ImageLimits = DEFAULT_LIMITS,
     ) -> Enrollment:
-        """Enroll from 1 to 10 photo files.
-
-        Parameters
-        ----------
-        policy, quality, limits
-            See ``ModelPack.embed_photo``; ``attributes`` and ``holder`` see
-            ``from_embeddings``.
+        """Enroll from 1 to 10 photo files; parameters as in `from_embeddings` and `PhotoOptions`.
 
         Raises
         ------
@@ -163,16 +143,16 @@ class Enroller:
         )
         if not 1 <= len(photos) <= MAX_PHOTOS:
             raise ValueError(f"an enrollment has 1 to {MAX_PHOTOS} photos, not {len(photos)}")
-        samples = embed_photos(
-            pack, photos, policy=policy, quality=quality, limits=limits, digested=True
+        samples = pack.embed_photos(
+            photos, policy=policy, quality=quality, limits=limits, digested=True
         )
         embeddings = np.stack([sample.embedding for sample in samples])
         return self._lifted(
             unit_rows(embeddings, n=info.n, most=MAX_PHOTOS),
             [cast("bytes", sample.picture) for sample in samples],
-            attributes=attributes,
-            holder=holder,
-            results=[PhotoResult(index, sample.quality) for index, sample in enumerate(samples)],
+            attributes,
+            holder,
+            [PhotoResult(index, sample.quality) for index, sample in enumerate(samples)],
         )
 
     def from_embeddings(
@@ -199,19 +179,13 @@ class Enroller:
             Where the embeddings part into two groups less alike than ``photo_consistency``.
         """
         rows = unit_rows(embeddings, n=self._contract.binding.n, most=MAX_PHOTOS)
-        return self._lifted(
-            rows,
-            [row.tobytes() for row in rows],
-            attributes=attributes,
-            holder=holder,
-            results=[PhotoResult(index) for index in range(len(rows))],
-        )
+        results = [PhotoResult(index) for index in range(len(rows))]
+        return self._lifted(rows, [row.tobytes() for row in rows], attributes, holder, results)
 
     def _lifted(
         self,
         rows: NDArray[np.float32],
         photos: Sequence[bytes],
-        *,
         attributes: Attributes | None,
         holder: Holder | None,
         results: Sequence[PhotoResult],
@@ -246,11 +220,6 @@ class Enroller:
         does, is refused. One that was laid through a few dozen people is not: nothing tells it
         from a lift of one of them.
 
-        Parameters
-        ----------
-        holder
-            See ``from_embeddings``.
-
         Raises
         ------
         InvalidTemplate
@@ -272,12 +241,7 @@ class Enroller:
         """Enroll the template of an export that a service sealed, without the tenant's rotation.
 
         As :meth:`from_template`, for a template that was made of photos by the service itself, or
-        that a holder's rotation turns still.
-
-        Parameters
-        ----------
-        holder_salt
-            Of the holder's rotation; None where the template needs no key.
+        that a holder's rotation turns still: then ``holder_salt`` is that rotation's.
         """
         return self._spanned_anew(self._received(data), holder_salt)
 

@@ -56,13 +56,7 @@ class PublicContract:
         return self.binding.contract_id
 
     def consistency(self, *, probe: bool) -> float:
-        """Return the least agreement of the photos of one probe, or of one enrollment.
-
-        Raises
-        ------
-        ContractError
-            The contract lacks it.
-        """
+        """Return the least agreement of the photos of one probe, or of one enrollment."""
         name = "probe_consistency" if probe else "photo_consistency"
         consistency = self._document.get(name)
         if not isinstance(consistency, int | float) or not -1 <= consistency <= 1:
@@ -70,34 +64,18 @@ class PublicContract:
         return float(consistency)
 
     def probe_dimension(self, dim: int | None) -> int:
-        """Return the dimension of a probe: `dim`, or the largest that the contract takes.
-
-        Raises
-        ------
-        ContractError
-            The contract takes no probes, or none of this dimension.
-        """
+        """Return the dimension of a probe: `dim`, or the largest that the contract takes."""
         if not self.probe_dimensions:
             raise ContractError(
                 "the contract takes no lifted probes; calibrate it with --probe-dims"
             )
-        if dim is None:
-            return self.probe_dimensions[-1]
-        if dim not in self.probe_dimensions:
+        if dim not in (None, *self.probe_dimensions):
             known = ", ".join(map(str, self.probe_dimensions))
             raise ContractError(f"the contract takes lifted probes of dimension {known}, not {dim}")
-        return dim
+        return dim or self.probe_dimensions[-1]
 
     def load_pack(self, folder: Path) -> ModelPack:
-        """Load the contract's model pack.
-
-        Raises
-        ------
-        ContractMismatch
-            The pack is another one.
-        PackError
-            The pack cannot be used.
-        """
+        """Load the contract's model pack, and check that it is the one."""
         pack = ModelPack.load(folder, threads=1, flip=bool(self.binding.preprocessing.get("flip")))
         info = pack.info
         self.binding.require_embedder(
@@ -106,13 +84,7 @@ class PublicContract:
         return pack
 
     def require_decoys(self, generator: DecoyGenerator) -> DecoyGenerator:
-        """Return the contract's own of a generator that may have more axes.
-
-        Raises
-        ------
-        ContractMismatch, DecoyError
-            It is another contract's.
-        """
+        """Return the contract's own of a generator that may have more axes, or refuse it."""
         source = generator.reduced(self.binding.axes)
         self.binding.require_source(source_id=source.source_id, made_with=source.made_with)
         return source
@@ -125,21 +97,14 @@ class PublicContract:
         m: int,
         probe: bool,
     ) -> bytes:
-        """Average embeddings of one person, project and lift the mean, and encode the template.
+        """Average unit embeddings (N, n) of one person, lift the mean, and encode the template.
 
         Parameters
         ----------
-        embeddings
-            Unit rows of one person, shape (N, n).
         decoys
             What :meth:`require_decoys` returned.
         m
             Dimension: the binding's, or one of :meth:`probe_dimension`.
-
-        Raises
-        ------
-        InconsistentImages
-            The embeddings are not of one person.
         """
         mean = mean_embedding(embeddings, consistency=self.consistency(probe=probe))
         stream = Keystream.fresh()

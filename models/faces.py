@@ -12,16 +12,18 @@ from models.quality import Quality
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FaceCrop:
-    """One face of a photo, before it is embedded; the photo itself is not kept.
+    """One face of a photo; the photo itself is not kept, and ``repr`` shows no pixel.
 
     Attributes
     ----------
     crop
-        Aligned, RGB uint8, shape (s, s, 3). Never shown by ``repr``.
+        Aligned, RGB uint8, shape (s, s, 3).
     face
         As it was detected; ``None`` for crops that came aligned.
-    liveness, picture
-        As in `FaceSample`.
+    liveness
+        How live the face looks (`PassiveLiveness.score`); ``None`` where it was not asked for.
+    picture
+        SHA-256 of the decoded photo; ``None`` where it was not asked for.
     """
 
     crop: NDArray[np.uint8] = field(repr=False)
@@ -39,24 +41,8 @@ class FaceCrop:
         return x1, y1, x2, y2
 
 
-@dataclass(frozen=True, eq=False)
-class FaceSample:
-    """One face of a photo, embedded.
-
-    Attributes
-    ----------
-    embedding
-        float32, shape (n,), unit norm. Never shown by ``repr``.
-    box
-        x1, y1, x2, y2 in pixels of the upright photo; ``None`` for crops that came aligned.
-    liveness
-        How live the face looks (`PassiveLiveness.score`); ``None`` where it was not asked for.
-    picture
-        SHA-256 of the decoded photo; ``None`` where it was not asked for. Never shown by ``repr``.
-    """
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FaceSample(FaceCrop):
+    """One face of a photo with its embedding, float32, shape (n,), unit norm."""
 
     embedding: NDArray[np.float32] = field(repr=False)
-    quality: Quality
-    box: Box | None
-    liveness: float | None = None
-    picture: bytes | None = field(default=None, repr=False)

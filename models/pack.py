@@ -17,7 +17,7 @@ from models.demo import DEMO_DIMENSION, is_demo_model, require_face
 from models.detection import DEFAULT_SIZE, Detector, find_faces, require_upright
 from models.detectors import Scrfd, YuNet
 from models.embedding import Embedder, Preprocessing, normalises_inside
-from models.errors import ImageError, ModelError, PackError
+from models.errors import ImageError, ModelError, PackError, PhotoRejected
 from models.faces import FaceCrop, FaceSample
 from models.liveness import PassiveLiveness, open_liveness
 from models.pack_file import PackFile
@@ -42,12 +42,8 @@ class PackInfo:
 
     Attributes
     ----------
-    name
-        Of the folder, or of the file without its suffix.
-    embedder_file, embedder_sha256
-        Name and SHA-256 (hex) of the embedder's file.
     preprocessing
-        JSON-able; with the hash it decides whether embeddings are comparable.
+        JSON-able; with the embedder's hash it decides whether embeddings are comparable.
     detector
         ``None`` where the pack takes aligned crops only.
     """
@@ -191,10 +187,7 @@ class ModelPack:
     def liveness(self) -> PassiveLiveness | None:
         """The liveness graphs, tried when they are first asked for; ``None`` where none are.
 
-        Raises
-        ------
-        PackError
-            If they cannot be used. A pack whose liveness nobody asks for works all the same.
+        A pack whose liveness nobody asks for works all the same where they cannot be used.
         """
         return self._open_liveness()
 
@@ -204,18 +197,7 @@ class ModelPack:
         return self._embedder.preprocessing.size
 
     def detect(self, image: NDArray[np.uint8]) -> list[Face]:
-        """Faces of an image, the one most likely meant first (`boxes.centre_rank`).
-
-        Parameters
-        ----------
-        image
-            RGB uint8, shape (h, w, 3).
-
-        Raises
-        ------
-        PackError
-            If the pack has no detector.
-        """
+        """Faces of an RGB image, the one most likely meant first (`boxes.centre_rank`)."""
         if self._detector is None:
             raise PackError(
                 f"The pack {self.info.name} has no detector; add a SCRFD or YuNet .onnx file to"
@@ -228,18 +210,7 @@ class ModelPack:
         return align(image, face.keypoints, size=self.crop_size)
 
     def embed(self, aligned: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Embed aligned crops.
-
-        Parameters
-        ----------
-        aligned
-            RGB uint8, shape (B, s, s, 3).
-
-        Returns
-        -------
-        ndarray of float32, shape (B, n)
-            Unit rows.
-        """
+        """Embed aligned crops, RGB uint8 (B, s, s, 3), to unit rows, float32 (B, n)."""
         return self._embedder.embed(aligned, flip=self._embedder.preprocessing.flip)
 
     def embed_both(
@@ -289,13 +260,7 @@ class ModelPack:
         return replace(taken, liveness=score, picture=picture_digest(image) if digested else None)
 
     def require_quality(self, taken: FaceCrop, limits: QualityLimits = DEFAULT_QUALITY) -> None:
-        """Refuse a face that fails a limit, by what this pack's detector recommends.
-
-        Raises
-        ------
-        FaceError
-            `FaceTooSmall` or `LowQuality`; `NoFace` of the demo model.
-        """
+        """Refuse a face that fails a limit, by what this pack's detector recommends."""
         recommended = 0.0 if self._detector is None else self._detector.recommended_score
         check(taken.quality, limits, recommended_score=recommended)
         if self._demo:
@@ -332,22 +297,30 @@ class ModelPack:
             If inference fails.
         """
         taken = self.crop_photo(data, **options)
-        return FaceSample(
-            embedding=self.embed(taken.crop[None])[0],
-            quality=taken.quality,
-            box=taken.box,
-            liveness=taken.liveness,
-            picture=taken.picture,
-        )
+        return FaceSample(**vars(taken), embedding=self.embed(taken.crop[None])[0])
 
-    def as_aligned(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Take a square picture as an aligned crop, resized to the embedder's size.
+    def embed_photos(
+        self, photos: Sequence[bytes], **options: Unpack[PhotoOptions]
+    ) -> list[FaceSample]:
+        """Embed photo files in their order; all or none. A file given twice is embedded once.
 
         Raises
         ------
-        ImageError
-            If it is not square.
+        PhotoRejected
+            Where one of them has no usable face, by its position.
         """
+        samples: dict[bytes, FaceSample] = {}
+        for index, photo in enumerate(photos):
+            if photo in samples:
+                continue
+            try:
+                samples[photo] = self.embed_photo(photo, **options)
+            except ModelError as error:
+                raise PhotoRejected(index, error, count=len(photos)) from error
+        return [samples[photo] for photo in photos]
+
+    def as_aligned(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Take a square picture as an aligned crop, resized to the embedder's size."""
         height, width = image.shape[:2]
         if height != width:
             raise ImageError(

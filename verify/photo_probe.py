@@ -11,7 +11,6 @@ from models.errors import FaceError, ModelError, PackError, PhotoRejected
 from models.faces import FaceCrop
 from models.head_pose import HeadPose, head_pose
 from models.pack import ModelPack
-from models.photos import embed_photos
 from models.quality import DEFAULT_QUALITY, QualityLimits
 from models.relief import details_of, shows_relief
 from models.selection import FacePolicy
@@ -86,7 +85,7 @@ def probe_of_photos(
     InconsistentImages
         Where the photos do not show one person.
     """
-    samples = embed_photos(pack, photos, policy=policy, limits=limits, liveness=passive)
+    samples = pack.embed_photos(photos, policy=policy, limits=limits, liveness=passive)
     rows = np.stack([sample.embedding for sample in samples])
     mean = mean_embedding(rows, consistency=contract.probe_consistency)
     distinct = [samples[place] for place in distinct_rows(rows)]
@@ -97,15 +96,7 @@ def probe_of_photos(
 
 
 def probe_of_embeddings(contract: Contract, embeddings: NDArray[np.floating]) -> PhotoProbe:
-    """Average 1 to 5 unit embeddings of one person, (k, n), that a client made of photos.
-
-    Raises
-    ------
-    InvalidEmbedding
-        Where an embedding is not a finite unit vector of n numbers.
-    InconsistentImages
-        Where they are not of one person.
-    """
+    """Average 1 to 5 unit embeddings of one person, (k, n), that a client made of photos."""
     rows = unit_rows(embeddings, n=contract.binding.n, most=MAX_PROBE_PHOTOS)
     mean = mean_embedding(rows, consistency=contract.probe_consistency)
     return PhotoProbe(mean, len(distinct_rows(rows)), failure=None, clear=True)
@@ -167,13 +158,7 @@ def probe_of_frames(
 
 
 def passive_failure(contract: Contract, scores: Sequence[float]) -> LivenessFailure | None:
-    """Say whether photos fall below the contract's liveness threshold, by their mean score.
-
-    Raises
-    ------
-    Uncalibrated
-        Where the contract has no liveness threshold.
-    """
+    """Say whether photos fall below the contract's liveness threshold, by their mean score."""
     if contract.liveness is None or not scores:
         raise Uncalibrated("the contract has no liveness threshold")
     live = contract.liveness.is_live(float(np.mean(scores)))

@@ -1,6 +1,7 @@
 """Enrollment: what is stored, what is refused, and what never shows."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from numpy.typing import NDArray
 
 from enroll import Enroller, Enrollment, Holder
 from models.errors import NoFace, PhotoRejected
+from models.pack import ModelPack
 from templates.contract import wire
 from templates.contract.document import Contract
 from templates.decoys import Attributes, DecoyGenerator, DecoyPool
@@ -183,7 +185,7 @@ def test_malformed_embeddings_are_refused(enroller: Enroller, rows: NDArray[np.f
         enroller.from_embeddings(rows)
 
 
-class FakePack:
+class FakePack(ModelPack):
     """Stands for a model pack: the photo's byte is the row of ``PHOTOS``; 255 has no face."""
 
     def __init__(self, contract: Contract, **changes: object) -> None:
@@ -195,7 +197,7 @@ class FakePack:
         } | changes
         self.info = type("Info", (), facts)
 
-    def embed_photo(self, photo: bytes, **_: object) -> object:
+    def embed_photo(self, photo: bytes, **_: object) -> Any:
         if photo == b"\xff":
             raise NoFace("no face was found")
         # The second byte stands for what a file has beside its pixels.
@@ -204,7 +206,7 @@ class FakePack:
 
 
 def test_photos_are_embedded_and_enrolled(contract: Contract, enroller: Enroller) -> None:
-    enrollment = enroller.from_photos(FakePack(contract), [b"\x00", b"\x01"])  # type: ignore[arg-type]
+    enrollment = enroller.from_photos(FakePack(contract), [b"\x00", b"\x01"])
     assert [(r.index, r.quality) for r in enrollment.per_photo] == [(0, "good"), (1, "good")]
     mean = projected(unit(PHOTOS[0] + PHOTOS[1]))[None]
     assert stored_template(enrollment).contains(mean, tol=2e-3).all()
@@ -212,7 +214,7 @@ def test_photos_are_embedded_and_enrolled(contract: Contract, enroller: Enroller
 
 def test_files_of_the_same_pixels_give_the_same_set(contract: Contract, enroller: Enroller) -> None:
     first, again, other = (
-        stored_template(enroller.from_photos(FakePack(contract), photos))  # type: ignore[arg-type]
+        stored_template(enroller.from_photos(FakePack(contract), photos))
         for photos in ([b"\x00a", b"\x01a"], [b"\x00b", b"\x01a"], [b"\x00a", b"\x02a"])
     )
     assert largest_angle(first, again) < 1e-2
@@ -221,11 +223,11 @@ def test_files_of_the_same_pixels_give_the_same_set(contract: Contract, enroller
 
 def test_one_unusable_photo_refuses_the_set(contract: Contract, enroller: Enroller) -> None:
     with pytest.raises(PhotoRejected, match="photo 2 of 2: no face") as caught:
-        enroller.from_photos(FakePack(contract), [b"\x00", b"\xff"])  # type: ignore[arg-type]
+        enroller.from_photos(FakePack(contract), [b"\x00", b"\xff"])
     assert caught.value.index == 1
     assert isinstance(caught.value.cause, NoFace)
     with pytest.raises(ValueError, match="1 to 10 photos"):
-        enroller.from_photos(FakePack(contract), [b"\x00"] * 11)  # type: ignore[arg-type]
+        enroller.from_photos(FakePack(contract), [b"\x00"] * 11)
 
 
 @pytest.mark.parametrize(
@@ -243,7 +245,7 @@ def test_another_pack_is_refused_naming_both_sides(
     contract: Contract, enroller: Enroller, changes: dict[str, object], message: str
 ) -> None:
     with pytest.raises(ContractMismatch, match=message):
-        enroller.from_photos(FakePack(contract, **changes), [b"\x00"])  # type: ignore[arg-type]
+        enroller.from_photos(FakePack(contract, **changes), [b"\x00"])
 
 
 def test_another_source_or_rotation_is_refused(contract: Contract) -> None:

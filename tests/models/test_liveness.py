@@ -12,7 +12,6 @@ from models.alignment import template
 from models.errors import ModelError, NoFace, PackError
 from models.liveness import LivenessInput, box_region, crop_face, square_region
 from models.pack import ModelPack
-from models.photos import embed_photos
 from tests.models.graphs import (
     fixed_face_detector,
     mean_liveness,
@@ -264,7 +263,7 @@ def test_a_photo_is_decoded_and_detected_once(tmp_path, monkeypatch):
     assert sample.liveness == pytest.approx(pack.liveness.score(picture(8), BOX), abs=1e-4)
     assert np.array_equal(sample.embedding, plain.embedding)
     assert sample.box == pytest.approx(BOX, abs=1e-3)
-    several = embed_photos(pack, [data, data], quality=None, liveness=True)
+    several = pack.embed_photos([data, data], quality=None, liveness=True)
     assert [one.liveness for one in several] == [sample.liveness] * 2
 
 

@@ -96,7 +96,6 @@ class Lifter:
 
         from enroll.enroller import MAX_PHOTOS
         from models.errors import ModelError
-        from models.photos import embed_photos
         from models.selection import FacePolicy
         from templates.errors import VeilfaceError
 
@@ -106,7 +105,7 @@ class Lifter:
             raise LiftFailed(f"a template is made of 1 to {MAX_PHOTOS} photos, not {len(photos)}")
         try:
             m = contract.probe_dimension(self._dim) if probe else contract.binding.m
-            samples = embed_photos(inputs.pack, photos, policy=FacePolicy(face or "dominant"))
+            samples = inputs.pack.embed_photos(photos, policy=FacePolicy(face or "dominant"))
             rows = np.stack([sample.embedding for sample in samples])
             template = contract.lift(rows, inputs.decoys, m=m, probe=probe)
         except (ModelError, VeilfaceError) as error:

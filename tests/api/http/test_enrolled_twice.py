@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from attacks.stored.several_templates import nearest_common_points
 from models.pack import ModelPack
-from models.photos import embed_photos
 from templates.contract import wire
 from templates.keys.holder_key import encode_holder_key
 from templates.keys.rotation import holder_rotation
@@ -48,7 +47,7 @@ def stolen(
 def descriptors(deployment: Deployment) -> NDArray[np.float64]:
     assert deployment.settings.pack is not None
     pack = ModelPack.load(deployment.settings.pack, threads=1)
-    samples = [embed_photos(pack, photos_of(person)) for person in PEOPLE]
+    samples = [pack.embed_photos(photos_of(person)) for person in PEOPLE]
     rows = [np.stack([one.embedding for one in of_person]) for of_person in samples]
     means = np.stack([mean_embedding(of_person, consistency=-1.0) for of_person in rows])
     return deployment.source.project(means).astype(np.float64)
