@@ -22,18 +22,7 @@ TEMPLATE_NAME = "arcface-112"
 
 
 def template(size: int) -> NDArray[np.float64]:
-    """Five points of the template, (5, 2) float64, in pixels of a ``size`` x ``size`` crop.
-
-    Parameters
-    ----------
-    size
-        A multiple of 112, or of 128 (then x moves by ``8 * ratio``).
-
-    Raises
-    ------
-    PackError
-        For any other size, for which there is no common template.
-    """
+    """Five points of the template, (5, 2) float64, in pixels of a ``size`` x ``size`` crop."""
     if size > 0 and size % 112 == 0:
         return np.asarray(TEMPLATE_112 * (size / 112))
     if size > 0 and size % 128 == 0:

@@ -5,7 +5,6 @@ import struct
 import zipfile
 import zlib
 from pathlib import Path, PurePosixPath
-from typing import IO
 
 from models.errors import PackError
 from models.pack_file import FILE_NAME
@@ -43,18 +42,10 @@ def unpack(archive: Path, into: Path) -> tuple[list[Path], list[str]]:
         What was written.
     left_out
         Names of the entries that were not.
-
-    Raises
-    ------
-    PackError
-        It is no zip archive, is encrypted, or compressed other than by deflation; two graphs have
-        one name, or one that cannot be printed; it is too large; or it has no graph.
-    OSError
-        A file cannot be written.
     """
     written: list[Path] = []
     left_out: list[str] = []
-    total = 0
+    room = MAX_TOTAL_BYTES
     try:
         with zipfile.ZipFile(archive) as opened:
             entries = [entry for entry in opened.infolist() if not entry.is_dir()]
@@ -62,47 +53,38 @@ def unpack(archive: Path, into: Path) -> tuple[list[Path], list[str]]:
                 raise PackError(f"The archive has more than {MAX_ENTRIES} entries: not a pack.")
             for entry in entries:
                 name = PurePosixPath(entry.filename.replace("\\", "/")).name
-                if not _is_wanted(name):
+                if name[:1] == "." or not (name.lower().endswith(".onnx") or name == FILE_NAME):
                     left_out.append(entry.filename)
                     continue
-                _require_plain(entry, name)
+                # Other methods unpack to any size at once.
+                if not name.isprintable() or entry.compress_type not in _METHODS:
+                    raise PackError(
+                        "The archive has an entry that is neither stored nor deflated, or whose "
+                        f"name cannot be printed: {name[:100]!a}; extract it yourself."
+                    )
                 target = into / name
-                with opened.open(entry) as source, target.open("xb") as file:
-                    most = min(MAX_FILE_BYTES, MAX_TOTAL_BYTES - total)
-                    total += _copied(source, file, most=most)
+                if target.exists():
+                    raise PackError("The archive has two files of the same name.")
                 written.append(target)
-    except FileExistsError:
-        raise PackError("The archive has two files of the same name.") from None
+                room -= _copy(opened, entry, target, most=min(MAX_FILE_BYTES, room))
     except (*_BROKEN, OSError) as error:
         if isinstance(error, OSError) and error.errno not in (None, errno.EINVAL):
             raise
-        raise PackError(f"The archive cannot be read ({type(error).__name__}).") from error
+        raise PackError(
+            f"The archive is damaged or encrypted ({type(error).__name__}): fetch it again, or "
+            "extract it yourself."
+        ) from error
     if not any(file.suffix.lower() == ".onnx" for file in written):
         raise PackError("The archive has no .onnx file.")
     return written, left_out
 
 
-def _is_wanted(name: str) -> bool:
-    return not name.startswith(".") and (name.lower().endswith(".onnx") or name == FILE_NAME)
-
-
-def _require_plain(entry: zipfile.ZipInfo, name: str) -> None:
-    if not name.isprintable():
-        raise PackError(f"The archive has a name that cannot be printed: {name[:100]!a}.")
-    if entry.flag_bits & 0x1:
-        raise PackError("The archive is encrypted; extract it yourself.")
-    if entry.compress_type not in _METHODS:
-        raise PackError(
-            f"The archive has an entry that is neither stored nor deflated: {name[:100]}; extract"
-            " it yourself."
-        )
-
-
-def _copied(source: IO[bytes], file: IO[bytes], *, most: int) -> int:
+def _copy(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, target: Path, *, most: int) -> int:
     count = 0
-    while piece := source.read(_PIECE):
-        count += len(piece)
-        if count > most:
-            raise PackError("The archive is too large to be a pack.")
-        file.write(piece)
+    with archive.open(entry) as source, target.open("xb") as file:
+        while piece := source.read(_PIECE):
+            count += len(piece)
+            if count > most:
+                raise PackError("The archive is too large to be a pack.")
+            file.write(piece)
     return count

@@ -48,13 +48,7 @@ class Face:
 
 
 def centre_rank(face: Face, image_shape: tuple[int, ...]) -> float:
-    """Rank of a face as the one that is meant: ``area - 2 * ‖box centre - image centre‖²``.
-
-    Parameters
-    ----------
-    image_shape
-        Height and width first, as of a NumPy image.
-    """
+    """Rank of a face as the one that is meant: ``area - 2 * ‖box centre - image centre‖²``."""
     height, width = image_shape[:2]
     dx = float(face.box[0] + face.box[2]) / 2 - width / 2
     dy = float(face.box[1] + face.box[3]) / 2 - height / 2
@@ -78,22 +72,7 @@ def intersection_over_union(first: NDArray[np.float32], second: NDArray[np.float
 def non_maximum_suppression(
     boxes: NDArray[np.float32], scores: NDArray[np.float32], *, threshold: float
 ) -> NDArray[np.intp]:
-    """Greedy suppression of boxes that overlap a better one.
-
-    Parameters
-    ----------
-    boxes
-        Shape (k, 4), x1 y1 x2 y2, with positive sides.
-    scores
-        Shape (k,), above 0.
-    threshold
-        Boxes with an intersection over union above it are dropped.
-
-    Returns
-    -------
-    ndarray of intp
-        Indices that are kept, best score first; at most `MAX_CANDIDATES` are considered.
-    """
+    """Greedy suppression of boxes that overlap a better one."""
     if not len(boxes):
         return np.empty(0, dtype=np.intp)
     corners = boxes.astype(np.float64)

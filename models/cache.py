@@ -48,14 +48,7 @@ class EmbeddingCache:
 
     @classmethod
     def open_file(cls, path: str | Path, sealer: CacheSealer) -> "EmbeddingCache":
-        """Open an encrypted cache file, or start one where there is none.
-
-        Raises
-        ------
-        CacheError
-            If the opened content is no embedding cache. What the sealer raises for a wrong key or
-            a changed file passes through.
-        """
+        """Open an encrypted cache file, or start one where there is none."""
         cache = cls()
         cache._path, cache._sealer = Path(path), sealer
         if cache._path.exists():

@@ -32,50 +32,29 @@ _STRIP_PIXELS = 2**18
 
 BYTES_PER_PIXEL = 17
 """Most memory that decoding takes for a pixel, its result included: 16.4 of WebP, as measured."""
-MEMORY_AT_A_TIME = 24_000_000 * BYTES_PER_PIXEL
-"""What decoding may take at a time in one process.
-
-A file of 38 bytes may unpack to all the pixels that the limits admit, so the number of requests
-would otherwise multiply it.
-"""
+MEGAPIXELS_AT_A_TIME = 24
+"""What one process decodes at a time: a file of 38 bytes may unpack to all the pixels that the
+limits admit, and the number of requests would multiply it."""
 
 # Pillow's own guard, as the error that it is from twice as many pixels on.
 warnings.simplefilter("error", Image.DecompressionBombWarning)
 
 
-class Turns:
-    """Lets pictures be decoded at the same time while they together fit a budget of memory.
-
-    First come, first served, so that small pictures do not starve a large one. A picture that
-    exceeds the budget is decoded alone.
-
-    Parameters
-    ----------
-    budget
-        Bytes.
-    """
-
-    def __init__(self, budget: int) -> None:
-        self._budget = self._free = budget
-        self._next = threading.Lock()
-        self._changed = threading.Condition()
-
-    @contextmanager
-    def turn(self, size: int) -> Iterator[None]:
-        """Wait until ``size`` bytes fit, and hold them."""
-        size = min(size, self._budget)
-        with self._next, self._changed:
-            self._changed.wait_for(lambda: self._free >= size)
-            self._free -= size
-        try:
-            yield
-        finally:
-            with self._changed:
-                self._free += size
-                self._changed.notify()
+_free = threading.Semaphore(MEGAPIXELS_AT_A_TIME)
+_next = threading.Lock()
 
 
-_turns = Turns(MEMORY_AT_A_TIME)
+@contextmanager
+def turn(pixels: int) -> Iterator[None]:
+    """Wait until a picture fits into what is decoded at a time; first come, first served."""
+    share = min(-(-pixels // 10**6), MEGAPIXELS_AT_A_TIME)
+    with _next:
+        for _ in range(share):
+            _free.acquire()
+    try:
+        yield
+    finally:
+        _free.release(share)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,7 +91,7 @@ def decode_image(data: bytes, *, limits: ImageLimits = DEFAULT_LIMITS) -> NDArra
     The EXIF orientation is applied. Greyscale, palette, CMYK and 16-bit pictures are converted
     to 8-bit RGB (16 bits are scaled by 255/65535, not clipped); transparency is laid over white,
     the background of identity photos. Animated pictures are refused: which frame was meant is not
-    known. Pictures that together take more than `MEMORY_AT_A_TIME` wait for each other.
+    known. Pictures of together more than `MEGAPIXELS_AT_A_TIME` wait for each other.
 
     Parameters
     ----------
@@ -142,7 +121,7 @@ def decode_image(data: bytes, *, limits: ImageLimits = DEFAULT_LIMITS) -> NDArra
         )
     try:
         image, orientation = _open(data, limits)
-        with _turns.turn(image.width * image.height * BYTES_PER_PIXEL):
+        with turn(image.width * image.height):
             with image:
                 image.load()
                 pixels = _rgb(image)
@@ -167,13 +146,7 @@ def decode_image(data: bytes, *, limits: ImageLimits = DEFAULT_LIMITS) -> NDArra
 
 
 def picture_digest(pixels: NDArray[np.uint8]) -> bytes:
-    """SHA-256 of a decoded picture: equal for files that show the same pixels upright.
-
-    Parameters
-    ----------
-    pixels
-        As `decode_image` gives them.
-    """
+    """SHA-256 of a decoded picture: equal for files that show the same pixels upright."""
     digest = hashlib.sha256(repr(pixels.shape).encode())
     digest.update(pixels.data)
     return digest.digest()

@@ -52,16 +52,6 @@ def build_demo_pack(folder: Path) -> Path:
 
     The pack takes aligned 112 x 112 faces (:func:`models.synthetic.draw_face` draws them) with
     the usual ArcFace preprocessing.
-
-    Parameters
-    ----------
-    folder : Path
-        Made when it is missing. ``demo.onnx`` in it is replaced.
-
-    Raises
-    ------
-    OSError
-        The folder cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
     (folder / DEMO_FILE).write_bytes(demo_model_bytes())
@@ -96,17 +86,6 @@ def require_face(crop: NDArray[np.uint8]) -> None:
 
     Which side of an edge is the darker one differs between people, so opposite directions count
     together; and what every picture has of a direction is taken off.
-
-    Parameters
-    ----------
-    crop
-        RGB uint8, shape (112, 112, 3).
-
-    Raises
-    ------
-    NoFace
-        The cosine is below 0.34. Drawn faces have 0.44 or more, drawn faces that are not aligned,
-        other pictures and noise 0.25 or less.
     """
     edges, average = _undirected(_features_of(crop)), _undirected(_average_features())
     weight = np.square(_window(), dtype=np.float64)

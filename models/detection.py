@@ -95,16 +95,6 @@ def find_faces(detector: Detector, image: NDArray[np.uint8]) -> list[Face]:
     not sure of; and where a face is too large for the main canvas, only the smallest faces come
     from there. When nothing is found, the near canvas and then a border around the picture are
     tried.
-
-    Parameters
-    ----------
-    image
-        RGB uint8, shape (h, w, 3).
-
-    Returns
-    -------
-    list of Face
-        In pixels of ``image``, best score first; empty when all passes found nothing.
     """
     main, near = detector.sizes[0], detector.sizes[-1]
     canvas = detector.canvas(image, main)
@@ -183,15 +173,10 @@ def _inside_border(detector: Detector, image: NDArray[np.uint8], main: Size) -> 
 
 
 def quarter_turns(detector: Detector, crop: NDArray[np.uint8]) -> int:
-    """Quarter turns to the left that put a face upright; 0 where it is.
+    """Quarter turns to the left that put an aligned face (s, s, 3) upright; 0 where it is.
 
     The detector looks once at four small copies of the aligned crop, each turned by another right
     angle: it is surest of the upright one.
-
-    Parameters
-    ----------
-    crop
-        RGB uint8, shape (s, s, 3), aligned by the points that the detector found.
     """
     small = cv2.resize(crop, (_UPRIGHT_SIDE, _UPRIGHT_SIDE), interpolation=cv2.INTER_AREA)
     turned = [np.rot90(small, quarter) for quarter in range(4)]
@@ -208,11 +193,6 @@ def require_upright(detector: Detector, face: Face, crop: NDArray[np.uint8]) -> 
     """Refuse a face that is upside down or lies on its side, whatever else is asked of it.
 
     A second look is taken only of a face that the detector is less than sure of.
-
-    Raises
-    ------
-    LowQuality
-        With ``turned`` in its details.
     """
     if face.score >= detector.clear_score:
         return

@@ -51,13 +51,7 @@ class Preprocessing:
 
 
 class Embedder:
-    """An embedding graph, one image in and one row (batch, n) out, with its preprocessing.
-
-    Raises
-    ------
-    ModelError
-        If the graph does not run, or gives something else for a crop.
-    """
+    """An embedding graph, one image in and one row (batch, n) out, with its preprocessing."""
 
     def __init__(self, session: Session, preprocessing: Preprocessing) -> None:
         self._session = session
@@ -76,16 +70,6 @@ class Embedder:
             RGB uint8, shape (B, s, s, 3) with the size of the preprocessing.
         flip
             Whether the raw embedding of the mirrored crop is added before normalising.
-
-        Returns
-        -------
-        ndarray of float32, shape (B, n)
-            Unit L2 norm per row, C-contiguous.
-
-        Raises
-        ------
-        ModelError
-            If the crops have another shape or type, or an output is zero or not finite.
         """
         raw = self._raw(self._checked(crops))
         return self._normalised(raw + self._raw(crops[:, :, ::-1]) if flip else raw)
@@ -94,10 +78,6 @@ class Embedder:
         """Embed aligned crops without and with the mirror image, at the cost of the latter.
 
         Parameters and errors as in :meth:`embed`.
-
-        Returns
-        -------
-        two ndarrays of float32, shape (B, n)
         """
         raw = self._raw(self._checked(crops))
         return self._normalised(raw), self._normalised(raw + self._raw(crops[:, :, ::-1]))
@@ -134,18 +114,7 @@ class Embedder:
 
 
 def run_embedder(session: Session, values: NDArray[np.float32]) -> Rows:
-    """Run an embedding graph on pictures of one size, (B, s, s, 3), in its channel order.
-
-    Returns
-    -------
-    ndarray of float32, shape (B, n)
-        As the graph gives them.
-
-    Raises
-    ------
-    ModelError
-        If the graph gives something else than a row for each.
-    """
+    """Run an embedding graph on pictures of one size, (B, s, s, 3), in its channel order."""
     image = session.inputs[0]
     blob = np.ascontiguousarray(values.transpose(0, 3, 1, 2))
     step = image.shape[0] or len(blob)

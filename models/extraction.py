@@ -28,13 +28,7 @@ Advance = Callable[[int], None]
 
 @dataclass(frozen=True)
 class Photo:
-    """A photo by a name of its own, which stands for it in an :class:`Extraction`.
-
-    Parameters
-    ----------
-    source
-        The file, or the encoded photo itself.
-    """
+    """A photo by a name of its own, which stands for it in an :class:`Extraction`."""
 
     name: str
     source: Path | bytes = field(repr=False)
@@ -105,11 +99,6 @@ class Extractor:
     mirrored
         Embed every face with the mirror image added too, beside the embedding without it; the
         pack must be one without.
-
-    Raises
-    ------
-    ValueError
-        If ``mirrored`` is asked of a pack that adds the mirror image anyway.
     """
 
     def __init__(
@@ -134,26 +123,7 @@ class Extractor:
     def extract(
         self, photos: Iterable[Path | Photo], *, progress: Advance | None = None
     ) -> Extraction:
-        """Embed photos.
-
-        Parameters
-        ----------
-        photos
-            Files or photos, in any order; the order of the result follows it. A photo stands in
-            the result under its name as a path.
-        progress
-            Called with the number of photos done since the last call.
-
-        Returns
-        -------
-        Extraction
-            Every photo is in ``paths`` or in ``failures``.
-
-        Raises
-        ------
-        ModelError
-            If inference itself fails, which is not the fault of a file.
-        """
+        """Embed photos."""
         files = [one if isinstance(one, Photo) else Photo(str(one), one) for one in photos]
         prepared: list[_Prepared] = []
         keep_after = time.monotonic() + _KEPT_SECONDS

@@ -52,17 +52,6 @@ class HeadPose:
 def head_pose(keypoints: NDArray[np.floating]) -> HeadPose:
     """Measure the pose of a head by its five points.
 
-    Parameters
-    ----------
-    keypoints
-        Shape (5, 2), pixels: left eye, right eye, nose, left and right mouth corner as the viewer
-        sees them.
-
-    Raises
-    ------
-    LowQuality
-        Where eyes and mouth span no plane, as those of no visible face do.
-
     Notes
     -----
     Yaw and pitch are those of :func:`models.quality.measure_pose` once eyes and mouth lie on the

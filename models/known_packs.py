@@ -12,17 +12,7 @@ _APACHE = "Apache-2.0"
 
 @dataclass(frozen=True)
 class KnownPack:
-    """What is known of a pack before it is fetched.
-
-    Attributes
-    ----------
-    contents
-        Detector and embedder.
-    licence
-        Of the weights, as their owner states it; the training data may have terms of their own.
-    megabytes
-        To download.
-    """
+    """What is known of a pack before it is fetched."""
 
     contents: str
     licence: str

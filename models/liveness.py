@@ -67,20 +67,7 @@ class LivenessInput:
 
 
 class LivenessGraph:
-    """One graph of passive presentation attack detection.
-
-    Parameters
-    ----------
-    session
-        A graph with one image input and one output (batch, classes).
-    expects
-        Crop, input and reading of the output.
-
-    Raises
-    ------
-    ModelError
-        Where the graph does not run on such an input, or its output does not fit.
-    """
+    """One graph of passive presentation attack detection."""
 
     def __init__(self, session: Session, *, sha256: str, expects: LivenessInput) -> None:
         self._session = session
@@ -152,13 +139,7 @@ class LivenessGraph:
 
 
 class PassiveLiveness:
-    """The liveness graphs of a pack. Safe from several threads at once.
-
-    Raises
-    ------
-    ModelError
-        Where some score a share and others a difference, which have no mean.
-    """
+    """The liveness graphs of a pack. Safe from several threads at once."""
 
     def __init__(self, graphs: Sequence[LivenessGraph]) -> None:
         kinds = {graph.expects.score for graph in graphs}
@@ -189,11 +170,6 @@ class PassiveLiveness:
         -------
         float
             Mean over the graphs: in 0…1, or a difference of logits.
-
-        Raises
-        ------
-        ModelError
-            If the box is empty, or inference fails.
         """
         return sum(graph.score(picture, box) for graph in self.members) / len(self.members)
 
@@ -201,14 +177,7 @@ class PassiveLiveness:
 def open_liveness(
     graphs: Sequence[PackGraph], stated: PackFile, folder: Path, *, detects: bool
 ) -> PassiveLiveness | None:
-    """Make the liveness graphs of a pack ready; None where there is none.
-
-    Raises
-    ------
-    PackError
-        If ``pack.toml`` states a file that is not there, a graph does not do what is stated,
-        nothing says how far its crop reaches, or the pack has no detector.
-    """
+    """Make the liveness graphs of a pack ready; None where there is none."""
     for stated_graph in stated.liveness:
         if not (folder / stated_graph.file).is_file():
             raise PackError(
@@ -233,13 +202,7 @@ def open_liveness(
 
 
 def expected_input(graph: PackGraph, statement: LivenessStatement | None) -> LivenessInput:
-    """What a graph is fed: as stated, else as MiniFASNet is.
-
-    Raises
-    ------
-    PackError
-        If the size or the scale of the crop is not known, or not what the graph takes.
-    """
+    """What a graph is fed: as stated, else as MiniFASNet is."""
     stated = statement or LivenessStatement(file=graph.file)
     height, width = image_size(graph.session.inputs) or (None, None)
     size = height or stated.input_size
@@ -268,20 +231,7 @@ def expected_input(graph: PackGraph, statement: LivenessStatement | None) -> Liv
 
 
 def crop_face(picture: NDArray[np.uint8], box: Box, expects: LivenessInput) -> NDArray[np.uint8]:
-    """Cut a face with its surroundings out of a frame, (size, size, 3), as the graph was trained.
-
-    Parameters
-    ----------
-    picture
-        RGB uint8, shape (h, w, 3).
-    box
-        x1, y1, x2, y2 in pixels.
-
-    Raises
-    ------
-    ModelError
-        If the box has no area, or lies outside the frame.
-    """
+    """Cut a face with its surroundings, (size, size, 3), as the graph was trained."""
     height, width = picture.shape[:2]
     x1, y1, x2, y2 = box
     inside = min(x2, width) > max(x1, 0) and min(y2, height) > max(y1, 0)
@@ -298,16 +248,6 @@ def box_region(frame: tuple[int, int], box: Box, scale: float) -> Region:
 
     This is how minivision's Silent-Face-Anti-Spoofing cuts the crops that MiniFASNet is trained
     on: near a border the face is off the middle of the crop, and nothing is padded.
-
-    Parameters
-    ----------
-    frame
-        Width and height in pixels.
-
-    Returns
-    -------
-    tuple of int
-        First and past-the-last column and row: left, top, right, bottom.
     """
     sides = (box[2] - box[0], box[3] - box[1])
     fitting = min(scale, *((length - 1) / side for length, side in zip(frame, sides, strict=True)))

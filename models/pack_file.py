@@ -111,13 +111,7 @@ class PackFile(_Table):
 
 
 def read_pack_file(folder: Path) -> PackFile:
-    """Read ``pack.toml`` of a folder; nothing is stated where there is none.
-
-    Raises
-    ------
-    PackError
-        If the file is not TOML, has an unknown key, or a value of the wrong kind.
-    """
+    """Read ``pack.toml`` of a folder; nothing is stated where there is none."""
     path = folder / FILE_NAME
     if not path.is_file():
         return PackFile()

@@ -34,13 +34,7 @@ class Role(StrEnum):
 
 @dataclass(frozen=True)
 class PackGraph:
-    """One file of a pack, read once: what is hashed is what runs.
-
-    Attributes
-    ----------
-    reason
-        One sentence that says what the role was told from.
-    """
+    """One file of a pack, read once: what is hashed is what runs."""
 
     path: Path
     session: Session = field(repr=False)
@@ -74,25 +68,13 @@ class Location:
 
 
 def inspect(path: str | Path) -> list[PackGraph]:
-    """What every graph of a pack is, and why; unusable packs are reported, not refused.
-
-    Raises
-    ------
-    PackError
-        If there is no ``.onnx`` file, ``pack.toml`` is broken, or a file is no ONNX model.
-    """
+    """What every graph of a pack is, and why; unusable packs are reported, not refused."""
     location, stated = locate(Path(path))
     return [read_graph(file, stated) for file in location.files]
 
 
 def locate(path: Path) -> tuple[Location, PackFile]:
-    """Find the graphs of a folder, or the one that a file is, and what ``pack.toml`` states.
-
-    Raises
-    ------
-    PackError
-        If there is none, or ``pack.toml`` is broken.
-    """
+    """Find the graphs of a folder, or the one that a file is, and what ``pack.toml`` states."""
     if path.is_file():
         if path.suffix.lower() != _SUFFIX:
             raise PackError(f"{path} is not an .onnx file; name a pack folder or an embedder.")
@@ -118,15 +100,7 @@ def read_graph(
     providers: Sequence[str] = ("cpu",),
     threads: int | None = None,
 ) -> PackGraph:
-    """Load and recognise one graph.
-
-    Raises
-    ------
-    PackError
-        If the file cannot be read, is too large, or is no ONNX model.
-    ProviderUnavailable
-        If a requested provider is absent or failed to start.
-    """
+    """Load and recognise one graph."""
     try:
         if path.stat().st_size > _MAX_MODEL_BYTES:
             raise PackError(f"{path} is larger than {_MAX_MODEL_BYTES} bytes: not a face model.")
@@ -153,19 +127,7 @@ def image_size(inputs: Sequence[Tensor]) -> tuple[int | None, int | None] | None
 def classify(
     inputs: Sequence[Tensor], outputs: Sequence[Tensor], *, input_size: int | None = None
 ) -> tuple[Role, str]:
-    """Route a graph by its signature (docs/models.md "Packs").
-
-    Parameters
-    ----------
-    input_size
-        Side of the embedder's input as stated in ``pack.toml``, for graphs that leave it open.
-
-    Returns
-    -------
-    role : Role
-    reason : str
-        One sentence that says what it was told from.
-    """
+    """Route a graph by its signature (docs/models.md "Packs")."""
     size = image_size(inputs)
     last = [output.shape[-1] if output.shape else None for output in outputs]
     if size is None:
@@ -209,13 +171,7 @@ def classify(
 
 
 def pick(graphs: Sequence[PackGraph], folder: Path) -> tuple[PackGraph, PackGraph | None]:
-    """Choose the embedder and, where there is one, the detector.
-
-    Raises
-    ------
-    PackError
-        If there is no embedder, more than one of a kind, or only a detector without keypoints.
-    """
+    """Choose the embedder and, where there is one, the detector."""
     embedders = [graph for graph in graphs if graph.role is Role.EMBEDDER]
     detectors = [graph for graph in graphs if graph.role in (Role.SCRFD, Role.YUNET)]
     for kind, several in (("embedders", embedders), ("detectors", detectors)):

@@ -108,17 +108,7 @@ DEFAULT_QUALITY = QualityLimits()
 
 
 def measure(crop: NDArray[np.uint8], face: Face | None, image: NDArray[np.uint8]) -> Quality:
-    """Measure one face.
-
-    Parameters
-    ----------
-    crop
-        The aligned crop, RGB uint8, shape (s, s, 3).
-    face
-        The detection it came from; ``None`` for crops that came aligned.
-    image
-        The picture, RGB uint8, shape (h, w, 3); of crops that came aligned, the crop.
-    """
+    """Measure one face by its crop, its detection (None where it came aligned) and the picture."""
     grey = cv2.cvtColor(crop, cv2.COLOR_RGB2GRAY)
     if grey.shape != (_SIDE, _SIDE):
         grey = cv2.resize(grey, (_SIDE, _SIDE), interpolation=cv2.INTER_AREA)
@@ -164,11 +154,6 @@ def measure_sharpness(grey: NDArray[np.uint8]) -> float:
     blurs one direction only, which the usual variance of the Laplacian misses. Dividing by the
     variance makes it independent of exposure and contrast, so that dark skin or soft light is not
     taken for blur.
-
-    Parameters
-    ----------
-    grey
-        uint8, shape (112, 112).
     """
     smooth = cv2.GaussianBlur(grey.astype(np.float64), (0, 0), _SMOOTHING)
 
@@ -231,20 +216,7 @@ def measure_pose(keypoints: NDArray[np.floating]) -> tuple[float, float, float]:
 def check(
     quality: Quality, limits: QualityLimits = DEFAULT_QUALITY, *, recommended_score: float = 0.0
 ) -> None:
-    """Refuse a face that fails a limit.
-
-    Parameters
-    ----------
-    recommended_score
-        What ``min_score`` is where the limits leave it open.
-
-    Raises
-    ------
-    FaceTooSmall
-        If the box is too small: nothing else measured on it would mean much.
-    LowQuality
-        Naming every failed measure with its value and limit.
-    """
+    """Refuse a face that fails a limit."""
     if quality.face_size is not None and quality.face_size < limits.min_face_size:
         raise FaceTooSmall(
             f"The face is {quality.face_size:.0f} pixels wide; at least"

@@ -25,18 +25,7 @@ Details = tuple[NDArray[np.float32], NDArray[np.float32]]
 
 
 def details_of(crop: NDArray[np.uint8]) -> Details:
-    """Find the details of a face that are found again in another picture of it (SIFT).
-
-    Parameters
-    ----------
-    crop
-        The aligned crop, RGB uint8, shape (s, s, 3).
-
-    Returns
-    -------
-    tuple of ndarray
-        Places in a crop of 224 pixels, (k, 2), and descriptors, (k, 128); float32.
-    """
+    """Find the details of a face that are found again in another picture of it (SIFT)."""
     grey = cv2.cvtColor(crop, cv2.COLOR_RGB2GRAY)
     grey = cv2.resize(grey, (_SIDE, _SIDE), interpolation=cv2.INTER_CUBIC)
     sift = cv2.SIFT.create(nfeatures=_DETAILS, contrastThreshold=_CONTRAST, edgeThreshold=_EDGE)

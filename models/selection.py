@@ -39,28 +39,7 @@ def select_face(
     shape: tuple[int, ...],
     min_size: float = 0.0,
 ) -> Face:
-    """Return the face that is meant.
-
-    Parameters
-    ----------
-    faces
-        In the order of `boxes.ranked`.
-    policy
-        ``None`` takes the first in rank, which is large and central, as public protocols do: whom
-        a labelled photo shows is known.
-    shape
-        Height and width first, as of a NumPy image.
-    min_size
-        Shorter side of the box, in pixels, from which a face counts. Where none reaches it, the
-        largest is returned, so that the quality gate says that it is too small.
-
-    Raises
-    ------
-    NoFace
-        If there is none.
-    MultipleFaces
-        If the policy singles none of them out.
-    """
+    """Return the face that is meant."""
     if not faces:
         raise NoFace(
             "No face was found: hold the photo upright, and come closer, until the face fills a "

@@ -38,13 +38,7 @@ def available_providers() -> list[str]:
 
 
 def resolve_providers(names: Sequence[str]) -> list[str]:
-    """Full onnxruntime names for the requested providers, in the requested order.
-
-    Raises
-    ------
-    ProviderUnavailable
-        If a name is unknown, or its provider is not in the installed onnxruntime.
-    """
+    """Full onnxruntime names for the requested providers, in the requested order."""
     available = ", ".join(available_providers())
     if not names:
         raise ProviderUnavailable(f"No execution provider was named; available are: {available}.")
@@ -90,13 +84,6 @@ class Session:
     ----------
     inputs, outputs
         As onnxruntime describes them; ``inputs`` is empty where one is not of float32.
-
-    Raises
-    ------
-    PackError
-        If onnxruntime refuses the graph, or its weights lie in another file.
-    ProviderUnavailable
-        If a requested provider is absent or failed to start.
     """
 
     def __init__(
@@ -125,11 +112,6 @@ class Session:
         ----------
         outputs
             Names of the wanted outputs, in order; all where absent.
-
-        Raises
-        ------
-        ModelError
-            If onnxruntime fails on these inputs.
         """
         try:
             results = self._loaded.run(list(outputs) if outputs else None, dict(feeds))

@@ -53,25 +53,6 @@ def draw_person(identity: int) -> Person:
 def draw_face(identity: int, photo: int = 0, *, size: int = 112) -> NDArray[np.uint8]:
     """One photo of one synthetic person.
 
-    Parameters
-    ----------
-    identity : int
-        Seed of the person, 0 or greater.
-    photo : int
-        Seed of the photo; another number is another photo of the same person.
-    size : int
-        Side of the picture in pixels, 16 to 1024. The ArcFace template is scaled with it.
-
-    Returns
-    -------
-    uint8 (size, size, 3)
-        RGB, aligned. The same arguments give the same bytes.
-
-    Raises
-    ------
-    ValueError
-        A negative seed, or a size out of range.
-
     Examples
     --------
     >>> draw_face(7, 0).shape

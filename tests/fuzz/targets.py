@@ -60,7 +60,7 @@ def demand(holds: bool, promise: str) -> None:
 
 def image(folder: Path) -> Target:
     """``models.decoding``: any picture of a request."""
-    from models.decoding import DEFAULT_LIMITS, MEMORY_AT_A_TIME, decode_image, image_size
+    from models.decoding import BYTES_PER_PIXEL, DEFAULT_LIMITS, decode_image, image_size
     from models.errors import ImageError
     from tests.fuzz import regressions
     from tests.fuzz.pictures import Pictures
@@ -76,7 +76,7 @@ def image(folder: Path) -> Target:
         demand(max(height, width) <= DEFAULT_LIMITS.max_side, "no side above the limit")
         demand(height * width <= DEFAULT_LIMITS.max_pixels, "no more pixels than the limit")
 
-    most = MEMORY_AT_A_TIME // MIB + 1
+    most = DEFAULT_LIMITS.max_pixels * BYTES_PER_PIXEL // MIB + 1
     return Target(read, (ImageError,), Pictures().make, most, regressions.pictures())
 
 

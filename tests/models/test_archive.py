@@ -122,7 +122,7 @@ def test_broken_and_encrypted_archives_are_refused(tmp_path: Path) -> None:
         path.write_bytes(data)
         into = tmp_path / f"into-{number}"
         into.mkdir()
-        with pytest.raises(PackError, match="encrypted" if number == 0 else "cannot be read"):
+        with pytest.raises(PackError, match="damaged or encrypted"):
             unpack(path, into)
 
 
@@ -131,14 +131,11 @@ def test_what_is_neither_stored_nor_deflated_is_refused(tmp_path: Path, method: 
     path = tmp_path / "pack.zip"
     with zipfile.ZipFile(path, "w", method) as file:
         file.writestr("det.onnx", GRAPH)
-    with pytest.raises(PackError, match=r"neither stored nor deflated: det\.onnx"):
+    with pytest.raises(PackError, match=r"neither stored nor deflated.*det\.onnx"):
         unpack(path, target(tmp_path))
 
 
-METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA)
-
-
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
 @pytest.mark.parametrize("seed", range(5))
 def test_no_damage_writes_outside_or_fails_otherwise(
     tmp_path: Path, seed: int, method: int

@@ -1,4 +1,3 @@
-import base64
 import io
 import struct
 
@@ -112,21 +111,12 @@ def compressed_bmp(bits: int) -> bytes:
 NOISE = np.random.default_rng(0).integers(0, 256, (80, 80, 3), dtype=np.uint8)
 PHOTO = Image.fromarray(picture())
 WRONG_FILES = {
-    "is an AVIF picture": [encode(PHOTO, "AVIF"), box_of(b"mif1avif")],
-    "is a HEIC picture": [box_of(b"heic"), box_of(b"mif1")],
-    "is a video": [box_of(b"isom"), box_of(b"qt  "), b"\x1aE\xdf\xa3\x9fB\x86"],
-    "is a GIF picture": [encode(PHOTO, "GIF")],
-    "is a TIFF or raw picture": [encode(PHOTO, "TIFF"), b"MM\0*\0\0\0\x08"],
-    "is a JPEG 2000 picture": [encode(PHOTO, "JPEG2000", no_jp2=bare) for bare in (False, True)],
-    "is a JPEG XL picture": [b"\xff\x0a\x7a\x12", b"\0\0\0\x0cJXL \r\n\x87\n"],
-    "is a PDF document": [encode(PHOTO, "PDF")],
-    "is a ZIP archive": [b"PK\x03\x04\x14\0"],
-    "is an SVG drawing": [b'<?xml version="1.0"?>\n<svg width="9"/>', b"<svg/>"],
-    "is a web page": [b"\n<!DOCTYPE html><title>404</title>", b"<HTML><body>"],
-    "is a picture in base64": [base64.b64encode(encode(PHOTO, kind)) for kind in ("JPEG", "WEBP")],
+    "is a HEIC or AVIF picture": [
+        *(encode(PHOTO, "AVIF"), *map(box_of, (b"mif1avif", b"heic", b"mif1"))),
+    ],
     "is not a JPEG, PNG, WebP or BMP picture": [
-        *(encode(PHOTO, kind) for kind in ("PPM", "ICO", "TGA")),
-        *(b"\0", b"not a picture", png(0, 5)),
+        *(encode(PHOTO, kind) for kind in ("PPM", "GIF", "TIFF", "PDF")),
+        *(b"\0", b"not a picture", png(0, 5), box_of(b"isom")),
     ],
     "is compressed": [compressed_bmp(4), compressed_bmp(8)],
     "is empty": [b""],

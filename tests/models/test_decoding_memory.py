@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from models.decoding import BYTES_PER_PIXEL, ImageLimits, Turns
+from models.decoding import BYTES_PER_PIXEL, ImageLimits, turn
 from tests.models.pictures import encode, png, refusal
 from tests.patience import PATIENCE_S
 
@@ -75,31 +75,18 @@ def test_the_largest_picture_that_is_accepted_takes_the_stated_memory(mode, shar
     assert 3 * pixels < int(done.stdout) <= BYTES_PER_PIXEL * pixels
 
 
-def test_pictures_wait_while_the_budget_is_taken():
-    turns = Turns(10)
-    entered = {size: threading.Event() for size in (4, 5, 20)}
-    leave = {size: threading.Event() for size in (4, 5, 20)}
+def test_pictures_wait_while_others_fill_what_is_decoded_at_a_time():
+    entered = threading.Event()
 
-    def hold(size):
-        with turns.turn(size):
-            entered[size].set()
-            assert leave[size].wait(PATIENCE_S)
+    def enter(pixels):
+        with turn(pixels):
+            entered.set()
 
-    threads = {size: threading.Thread(target=hold, args=(size,)) for size in (4, 5, 20)}
-    threads[4].start()
-    assert entered[4].wait(PATIENCE_S)
-    threads[5].start()
-    assert entered[5].wait(PATIENCE_S)  # 9 of 10 are taken
-    threads[20].start()
-    assert not entered[20].wait(0.1)
-    leave[4].set()
-    assert not entered[20].wait(0.1)  # larger than the budget: it waits to be alone
-    leave[5].set()
-    assert entered[20].wait(PATIENCE_S)
-    leave[20].set()
-    for thread in threads.values():
-        thread.join(PATIENCE_S)
-    with pytest.raises(ZeroDivisionError), turns.turn(10):
+    with pytest.raises(ZeroDivisionError), turn(24_000_000):
         _ = 1 / 0
-    with turns.turn(10):  # what failed gave its share back
-        pass
+    with turn(14_000_000), turn(9_000_001):  # what failed gave its share back
+        waiting = threading.Thread(target=enter, args=(100_000_000,))
+        waiting.start()
+        assert not entered.wait(0.1)
+    assert entered.wait(PATIENCE_S)
+    waiting.join(PATIENCE_S)
