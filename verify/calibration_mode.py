@@ -109,26 +109,15 @@ class CalibrationOptions:
 
 @dataclass(frozen=True)
 class CalibrationReport:
-    """What an operator should read beside the contract; every calibration adds to its lists.
-
-    Parameters
-    ----------
-    suspicious
-        People who may be one person under two names: look at them before believing a threshold
-        at FMR 1e-4 or below (docs/thresholds.md "One person under two names").
-    unresolved
-        Sentences about the FMR targets that the data cannot resolve.
-    left_out
-        Sentences about the groups whose trials are too few for ``worst_group`` to heed them.
-    ten_folds
-        Results of the ten-fold protocol, one per calibration in the contract's order; empty
-        under protocol ``fmr``.
-    """
+    """What an operator should read beside the contract; every calibration adds to its lists."""
 
     consistency: Consistency
     suspicious: list[SuspiciousPair]
+    """People who may be one person under two names (docs/thresholds.md)."""
     unresolved: list[str] = field(default_factory=list)
+    """Sentences about the FMR targets that the data cannot resolve."""
     left_out: list[str] = field(default_factory=list)
+    """Sentences about the groups whose trials are too few for ``worst_group`` to heed them."""
     ten_folds: list[TenFold] = field(default_factory=list)
 
 
@@ -187,7 +176,7 @@ def calibrate_lifted(run: CalibrationRun, probe_m: int, rng: np.random.Generator
     """Calibrate lifted probes of one dimension."""
     options = run.options
     stream = Keystream.seeded("calibration probes", options.seed, probe_m)
-    trials = lifted_trials(
+    impostors, genuine, norms = lifted_trials(
         run.embeddings,
         run.plan,
         run.templates,
@@ -204,10 +193,10 @@ def calibrate_lifted(run: CalibrationRun, probe_m: int, rng: np.random.Generator
     )
     return _calibration(
         run,
-        trials.impostors,
-        trials.genuine,
+        impostors,
+        genuine,
         probe_m=probe_m,
-        norms=honest_norms(trials.foot_norms),
+        norms=honest_norms(norms),
     )
 
 

@@ -38,13 +38,7 @@ Progress = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class Lifter:
-    """Lifts as a service or a client of one contract does, through the wire format.
-
-    Parameters
-    ----------
-    contract_id
-        Written into the wire bytes.
-    """
+    """Lifts as a service or a client of one contract does, through the wire format."""
 
     strategy: Strategy
     source: DecoySource
@@ -87,16 +81,7 @@ def point_trials(
     consistency: float,
     progress: Progress,
 ) -> tuple[Impostors, Genuine]:
-    """Compare raw probes with the template of everybody who is compared.
-
-    Parameters
-    ----------
-    sets
-        The photos of every probe; those of more than one are averaged.
-    consistency
-        Least agreement of the photos of one probe: genuine ones below it are refused. Impostor
-        trials are all compared.
-    """
+    """Compare raw probes with the template of everybody who is compared."""
     people, compared = len(plan.people), len(plan.compared)
     owners = plan.person_of[sets.photos[sets.impostor, 0]]
     scores = np.empty((len(owners), compared), dtype=np.float32)
@@ -159,15 +144,6 @@ def _enrolled_photos(plan: TrialPlan, people: Indices) -> Indices:
     return np.array([len(photos) for photos in plan.enrolled], dtype=np.int64)[people]
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class LiftedTrials:
-    """Scores of lifted probes, and the foot-point norms that honest lifts have."""
-
-    impostors: Impostors
-    genuine: Genuine
-    foot_norms: NDArray[np.float64]
-
-
 def lifted_trials(
     embeddings: NDArray[np.float32],
     plan: TrialPlan,
@@ -183,11 +159,12 @@ def lifted_trials(
     rng: np.random.Generator,
     stream: Keystream,
     progress: Progress,
-) -> LiftedTrials:
+) -> tuple[Impostors, Genuine, NDArray[np.float64]]:
     """Compare lifted probes with their person's template, and with a random subset of others.
 
     Probes are at most ``most_probes`` photos, genuine ones first. Groups of them meet groups of
-    other people's templates, about ``impostor_pairs`` pairs in all.
+    other people's templates, about ``impostor_pairs`` pairs in all. Also returns the norms of
+    their foot points.
     """
     what = f"comparing lifted probes, m = {probe_m}"
     genuine_photos = plan.genuine
@@ -235,7 +212,7 @@ def lifted_trials(
     )
     z = ((close - means[: len(own)]) / spreads[: len(own)]).astype(np.float32)
     genuine = Genuine(z, own, _enrolled_photos(plan, own), refused=np.zeros(len(own), np.bool_))
-    return LiftedTrials(impostors, genuine, probes.foot_norms)
+    return impostors, genuine, probes.foot_norms
 
 
 def pair_similarities(

@@ -3,6 +3,7 @@
 import csv
 import hashlib
 import io
+import re
 from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -23,15 +24,7 @@ class DatasetError(VeilfaceError):
 
 @dataclass(frozen=True)
 class LabelledFolder:
-    """Photos with the names of the people on them.
-
-    Parameters
-    ----------
-    paths, identities
-        Equal lengths, sorted by person and file name.
-    ignored
-        What lay beside and was no photo, relative to ``root``.
-    """
+    """Photos with the names of the people on them."""
 
     root: Path
     paths: tuple[Path, ...]
@@ -69,11 +62,6 @@ def labelled_folder(root: Path | str) -> LabelledFolder:
 
     What else is :func:`visible`, such as ``pairs.txt`` or a photo beside the people's folders, is
     listed in ``ignored``.
-
-    Raises
-    ------
-    DatasetError
-        There is no folder, or no photo in a person's folder.
     """
     folder = Path(root)
     if not folder.is_dir():
@@ -131,13 +119,7 @@ def distinct_files(files: Sequence[Path]) -> list[Path]:
 
 @dataclass(frozen=True)
 class Trial:
-    """One comparison of a protocol; photos by a key that is unique in the set.
-
-    Parameters
-    ----------
-    fold
-        0 … 9; None where the protocol has none.
-    """
+    """One comparison of a protocol; photos by a key that is unique in the set."""
 
     first: str
     second: str
@@ -148,21 +130,7 @@ class Trial:
 def read_lfw_pairs(
     file: Path | str, paths: Sequence[Path], *, missing: Collection[Path] = ()
 ) -> list[Pair]:
-    """Read LFW's ``pairs.txt`` into positions in ``paths``.
-
-    Parameters
-    ----------
-    paths
-        Photos with an embedding, in its order; ``Name/Name_0001.jpg``.
-    missing
-        Photos of the same folder without an embedding; pairs that need one are left out. The
-        caller reports them as failures to acquire.
-
-    Raises
-    ------
-    DatasetError
-        Listing every faulty line.
-    """
+    """Read LFW's ``pairs.txt`` into positions in ``paths``."""
     path = Path(file)
     text = decoded(read_whole(path, most=MAX_PAIRS_BYTES), file=path)
     index = {f"{entry.parent.name}/{entry.stem}": number for number, entry in enumerate(paths)}
@@ -182,71 +150,45 @@ def read_lfw_pairs(
 
 
 def parse_lfw_pairs(path: Path, text: str) -> list[Trial]:
-    """Parse the text of LFW's ``pairs.txt``: keys are ``Name/Name_0001``.
-
-    ``path`` is for messages only.
+    """Parse the text of LFW's ``pairs.txt``: keys are ``Name/Name_0001``; ``path`` is for messages.
 
     The header is ``folds<TAB>pairs per class and fold``; every fold then has that many lines
     ``Name i j`` of one person and as many lines ``NameA i NameB j`` of two.
-
-    Raises
-    ------
-    DatasetError
-        Listing every faulty line.
     """
-    lines = text.splitlines()
-    folds, per_class = _header(path, lines)
-    promised = 2 * folds * per_class
-    while lines and not lines[-1].strip():
-        lines.pop()
-    if len(lines) - 1 != promised:
-        raise DatasetError(f"{path.name} promises {promised} pairs and holds {len(lines) - 1}")
+    header, *lines = text.rstrip().splitlines() or [""]
+    if not (match := re.fullmatch(r"(\d{1,6})\s+(\d{1,6})", header.strip())):
+        raise DatasetError(f"{path.name} does not begin with: folds, pairs per class and fold")
+    folds, per_class = map(int, match.groups())
+    if folds != FOLDS or per_class < 1:
+        raise DatasetError(f"{path.name} has {folds} folds; the protocol has {FOLDS}")
+    if len(lines) != 2 * folds * per_class:
+        raise DatasetError(
+            f"{path.name} promises {2 * folds * per_class} pairs and holds {len(lines)}"
+        )
     trials: list[Trial] = []
     faults: list[str] = []
-    for number, line in enumerate(lines[1:]):
+    for number, line in enumerate(lines):
         fold, place = divmod(number, 2 * per_class)
         same = place < per_class
-        keys = _photo_keys(line, same=same)
-        if keys is None:
+        parts = line.split("\t") if "\t" in line else line.split()
+        fits = len(parts) == (3 if same else 4)
+        parts[2:2] = parts[:1] if same else []
+        if not fits or not all(re.fullmatch(r"\d{1,6}", part) for part in parts[1::2]):
             form = "Name i j" if same else "NameA i NameB j"
             faults.append(f"line {number + 2} is not of the form {form}")
-        else:
-            trials.append(Trial(*keys, same, fold))
+            continue
+        one, other = (
+            f"{name}/{name}_{int(photo):04d}"
+            for name, photo in zip(parts[::2], parts[1::2], strict=True)
+        )
+        trials.append(Trial(one, other, same, fold))
     if faults:
         raise DatasetError(faults_in(path, "expected LFW's pairs format", faults))
     return trials
 
 
-def _header(path: Path, lines: Sequence[str]) -> tuple[int, int]:
-    numbers = lines[0].split() if lines else []
-    if len(numbers) != 2 or not all(number.isdecimal() and len(number) < 7 for number in numbers):
-        raise DatasetError(f"{path.name} does not begin with: folds, pairs per class and fold")
-    folds, per_class = map(int, numbers)
-    if folds != FOLDS or per_class < 1:
-        raise DatasetError(f"{path.name} has {folds} folds; the protocol has {FOLDS}")
-    return folds, per_class
-
-
-def _photo_keys(line: str, *, same: bool) -> tuple[str, str] | None:
-    """Keys of both photos, or None where the line has another form."""
-    parts = line.split("\t") if "\t" in line else line.split()
-    if len(parts) != (3 if same else 4):
-        return None
-    first, i, *rest = parts
-    second, j = (first, rest[0]) if same else (rest[0], rest[1])
-    if not all(number.isdecimal() and len(number) < 7 for number in (i, j)):
-        return None
-    return f"{first}/{first}_{int(i):04d}", f"{second}/{second}_{int(j):04d}"
-
-
 def read_whole(file: Path, *, most: int) -> bytes:
-    """Read a file of at most ``most`` bytes.
-
-    Raises
-    ------
-    DatasetError
-        The file is larger, or cannot be read.
-    """
+    """Read a file of at most ``most`` bytes."""
     try:
         if not file.is_file():
             raise DatasetError(f"{file} is not there")
@@ -262,13 +204,7 @@ def read_whole(file: Path, *, most: int) -> bytes:
 
 
 def decoded(data: bytes, *, file: Path) -> str:
-    """Decode UTF-8, with or without a byte-order mark; ``file`` is for messages only.
-
-    Raises
-    ------
-    DatasetError
-        It is other text, or none.
-    """
+    """Decode UTF-8, with or without a byte-order mark; ``file`` is for messages only."""
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -282,26 +218,7 @@ def csv_rows(
     required: Collection[str],
     optional: Collection[str] | None = None,
 ) -> list[tuple[str, dict[str, str]]]:
-    """Read a table whose columns go by their names, in any case and order.
-
-    Parameters
-    ----------
-    file
-        For messages only.
-    optional
-        Columns that may be there too; any where None.
-
-    Returns
-    -------
-    list of (where, row)
-        Of every line that is not blank: how a message names it, and its cells by column.
-
-    Raises
-    ------
-    DatasetError
-        Naming the first fault: a column that is absent, unknown, without a name or there twice; a
-        line that is no CSV, or has more or fewer cells than there are columns.
-    """
+    """Read a table whose columns go by their names, in any case and order."""
     reader = csv.reader(io.StringIO(text, newline=""), strict=True)
     rows = []
     try:

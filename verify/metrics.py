@@ -24,13 +24,6 @@ RULE_OF_THREE = 3.0
 def wilson(errors: float, trials: int, *, confidence: float = 0.95) -> tuple[float, float]:
     """Wilson score interval of a proportion; (0, 1) where there are no trials.
 
-    Parameters
-    ----------
-    errors
-        Number of errors; a mean over repeats of the same trials need not be whole.
-    confidence
-        Of the two-sided interval.
-
     References
     ----------
     E. B. Wilson, "Probable inference, the law of succession, and statistical inference",
@@ -80,11 +73,6 @@ def threshold_at_fmr(impostor: ArrayLike, target: float, *, trials: int | None =
     trials
         Number of trials, where ``impostor`` holds only their highest similarities, more of them
         than the target allows errors.
-
-    Raises
-    ------
-    ValueError
-        Without impostors, or with a target outside [0, 1].
     """
     scores = np.sort(np.asarray(impostor, dtype=np.float64).ravel())[::-1]
     if scores.size == 0 or not 0.0 <= target <= 1.0:
@@ -99,13 +87,8 @@ def threshold_at_fmr(impostor: ArrayLike, target: float, *, trials: int | None =
     above = scores[scores > first_rejected]
     if above.size == 0:
         return float(np.nextafter(first_rejected, np.inf))
-    return between(first_rejected, above[-1])
-
-
-def between(rejected: float, accepted: float) -> float:
-    """Threshold halfway between two similarities, which rejects the lower and accepts the upper."""
-    middle = float(rejected) + (float(accepted) - float(rejected)) / 2
-    return middle if middle > rejected else float(accepted)
+    middle = float(first_rejected) + (float(above[-1]) - float(first_rejected)) / 2
+    return middle if middle > first_rejected else float(above[-1])
 
 
 def resolvable(target: float, trials: int, *, expected_errors: float = RULE_OF_THREE) -> bool:
@@ -120,15 +103,9 @@ def resolvable(target: float, trials: int, *, expected_errors: float = RULE_OF_T
 
 @dataclass(frozen=True, repr=False)
 class ErrorCurve:
-    """FMR and FNMR at every threshold that changes either (the DET curve's points).
+    """FMR and FNMR at every threshold that changes either (the DET curve's points)."""
 
-    Parameters
-    ----------
-    thresholds, fmr, fnmr
-        Float64 arrays of equal length; thresholds ascend, FMR falls, FNMR rises.
-    """
-
-    thresholds: Array64
+    thresholds: Array64  # rising
     fmr: Array64
     fnmr: Array64
 
@@ -165,18 +142,10 @@ def subject_bootstrap(
     """Rate with an interval that resamples people, since trials share them.
 
     A replicate draws ``people`` people with replacement; a person drawn w times weighs w. A trial
-    between people a ≠ b weighs w_a w_b, a trial within one person w_a. The percentile interval
-    of the replicates is widened to the Wilson interval where it is narrower: with few errors, or
-    none, resampling what was seen knows nothing of what was not.
-
-    Parameters
-    ----------
-    errors : (E, 2) integers
-        The two people of every trial that went wrong.
-    people
-        Number of people; the indices in ``errors`` are below it.
-    weighted_trials
-        Total weight of all trials under the (people,) weights of one replicate.
+    between people a ≠ b weighs w_a w_b, a trial within one person w_a. ``errors`` has the two
+    people of every trial that went wrong, (E, 2). The percentile interval of the replicates is
+    widened to the Wilson interval where it is narrower: with few errors, or none, resampling what
+    was seen knows nothing of what was not.
     """
     count = len(errors)
     low, high = wilson(count, trials)

@@ -6,7 +6,6 @@ nobody, but along its axes the faces that it was made of do not correlate, and o
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,26 +28,13 @@ _REMEDY = (
 )
 
 
-@dataclass(frozen=True)
-class Memory:
-    """How embeddings correlate along the principal axes of a generator's decoys.
+def remembers(generator: DecoyGenerator, embeddings: NDArray[np.floating]) -> bool:
+    """Whether (N, n) unit embeddings correlate less along a generator's axes than chance has it.
 
-    Parameters
-    ----------
-    correlation
-        Mean squared correlation of two axes, times the number of embeddings. Those of the fit do
-        not correlate at all; those of other people correlate by chance alone to 1, and by more
-        where they are of another kind or several photos of one person.
-    least
-        What chance alone reaches all but surely.
+    The mean squared correlation of two axes, times N, is 0 for the embeddings of the fit. For other
+    people it is 1 by chance alone, and more where they are of another kind or several photos of
+    one person.
     """
-
-    correlation: float
-    least: float
-
-
-def memory(generator: DecoyGenerator, embeddings: NDArray[np.floating]) -> Memory:
-    """Measure what a generator remembers of (N, n) unit embeddings."""
     turn = np.linalg.eigh(generator.covariance)[1][:, ::-1]
     scores = np.asarray(embeddings, dtype=np.float64) @ generator.axes.astype(np.float64) @ turn
     # The leading axes carry clusters, such as gender, which correlate in any part of the people.
@@ -58,14 +44,13 @@ def memory(generator: DecoyGenerator, embeddings: NDArray[np.floating]) -> Memor
     lengths = np.linalg.norm(scores, axis=0)
     scores = scores[:, lengths > 1e-4 * lengths.max()]
     if scores.shape[1] < 2:  # nothing to correlate
-        return Memory(correlation=1.0, least=0.0)
+        return False
     scores /= np.linalg.norm(scores, axis=0)
     squares = (scores.T @ scores) ** 2
     pairs = squares.shape[0] * (squares.shape[0] - 1)
-    between = float(squares.sum() - np.trace(squares)) / pairs
+    correlation = len(scores) * float(squares.sum() - np.trace(squares)) / pairs
     # Of each unordered pair, a square of variance 2 where the mean is 1.
-    least = 1 - LEAST_DEVIATIONS * float(np.sqrt(2 / (pairs / 2)))
-    return Memory(correlation=len(scores) * between, least=least)
+    return bool(correlation < 1 - LEAST_DEVIATIONS * np.sqrt(2 / (pairs / 2)))
 
 
 def require_others(
@@ -73,24 +58,18 @@ def require_others(
 ) -> None:
     """Refuse decoys that were made of the people who are to be calibrated on.
 
+    A generator must not be fitted to these embeddings or most of them; at most one in fifty people
+    may have a pool entry that is as alike as two photos of one person are.
+
     Parameters
     ----------
     embeddings, identities : (N, n) float32 unit rows, N names
         Of the calibration, without those that are left out of it.
-
-    Raises
-    ------
-    ContractError
-        A generator was fitted to these embeddings or most of them, or more than one in fifty
-        people have a pool entry that is as alike as two photos of one person are. Also where there
-        are no two people to compare.
-
     """
     names, person = np.unique(np.asarray(identities, dtype=np.str_), return_inverse=True)
     firsts = np.unique(person, return_index=True)[1]
     if isinstance(source, DecoyGenerator):
-        seen = [memory(source, rows) for rows in (embeddings, embeddings[firsts])]
-        if any(trace.correlation < trace.least for trace in seen):
+        if any(remembers(source, rows) for rows in (embeddings, embeddings[firsts])):
             raise ContractError(
                 "the decoys were made of the photos of these people, or of most of them: " + _REMEDY
             )

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from templates.decoys import DecoyGenerator, DecoyPool
 from templates.errors import ContractError
 from tests.verify.synthetic import People, draw_people, unit
-from verify.own_decoys import memory, require_others
+from verify.own_decoys import require_others
 
 
 def uneven(people: People, *, power: float = 0.5) -> People:
@@ -52,14 +52,6 @@ def test_a_generator_of_others_is_not(count: int) -> None:
     for calibrated, power in product((20, 80, 300), (0.3, 0.5, 0.6)):
         people = drawn(calibrated, seed=2, power=power)
         assert refused(source, people) is None, (calibrated, power)
-
-
-def test_people_of_the_fit_do_not_correlate_along_its_axes() -> None:
-    """The axes are the eigenvectors of their covariance; by chance the measure is 1."""
-    people, others = drawn(200), drawn(200, photos=1, seed=3)
-    generator = DecoyGenerator.fit(people.descriptors)
-    assert memory(generator, people.descriptors).correlation < 0.01
-    assert memory(generator, others.descriptors).correlation > 1.0
 
 
 def test_a_pool_that_holds_the_people_is_refused_by_other_photos_of_them_too() -> None:
