@@ -70,11 +70,6 @@ def movements_failure(
     depends on a person's proportions or on how the camera is held. Of two movements in one frame
     the larger counts, by its own measure. Coming closer counts once: whoever stays near makes the
     later movements there, and those frames count by their turn. Frames between movements are free.
-
-    Parameters
-    ----------
-    flat
-        Places of the frames that a flat picture may show: none of them shows a turn.
     """
     if abs(poses[0].yaw) > FRONT_YAW or abs(poses[0].pitch) > FRONT_PITCH:
         return LivenessFailure.NOT_FRONTAL
@@ -95,13 +90,7 @@ def movements_failure(
 
 
 def movement_of(pose: HeadPose, first: HeadPose, *, near: bool = False) -> Movement | None:
-    """Return the movement that a head has made since its first frame, if it made any.
-
-    Parameters
-    ----------
-    near
-        Whether it came closer in an earlier frame, which counts once.
-    """
+    """Return the movement that a head has made since its first frame, if it made any."""
     reached = _turns(pose, first)
     if not near:
         reached[Movement.COME_CLOSER] = math.log(pose.scale / first.scale) / math.log(CLOSER)

@@ -73,22 +73,6 @@ def photo_consistency(
     so that mislabelled photos among the genuine sets cannot lower it further. A probe's limit is
     that raw cosine at FMR 1e-3, and so is an enrollment's where nobody has two photos.
 
-    Parameters
-    ----------
-    embeddings : (N, n) float32
-        Unit rows.
-    person_of : (N,) int64
-    photos
-        Photos of one enrollment, and so of a genuine set; fewer where fewer than 40 people have as
-        many, but two at least.
-    rng
-        Chooses the sets, and the pairs where there are very many photos.
-
-    Raises
-    ------
-    ContractError
-        Where there is no pair of photos of different people.
-
     Notes
     -----
     Few calibrations resolve an FMR of 1e-6. The cosine there is extrapolated: the excesses over
@@ -183,11 +167,6 @@ def impostor_cosines(
     """Raw cosines of all pairs of photos of different people.
 
     Of more than ``MOST_PHOTOS`` photos a random subset of that many is compared.
-
-    Raises
-    ------
-    ContractError
-        Where there is no such pair.
     """
     if len(embeddings) > MOST_PHOTOS:
         kept = rng.choice(len(embeddings), MOST_PHOTOS, replace=False)

@@ -62,13 +62,7 @@ def label_files(source: Path) -> list[Path]:
 
 
 def read_labels(file: Path) -> dict[Path, Label]:
-    """Read a label file: labels by the resolved path of the photo.
-
-    Raises
-    ------
-    DatasetError
-        Naming the file, the line, and what was expected.
-    """
+    """Read a label file: labels by the resolved path of the photo."""
     folder = file.resolve().parent
     text = decoded(read_whole(file, most=_MAX_BYTES), file=file)
     labels = {}

@@ -20,24 +20,10 @@ from verify.trials import Indices
 
 @dataclass(frozen=True, repr=False)
 class PhotoLabels:
-    """Labels of photos.
+    """Labels of photos."""
 
-    Parameters
-    ----------
-    of
-        By attribute, such as ``gender``: the label of every photo; None where it has none.
-    source
-        Where they come from, in words, for the contract.
-
-    Raises
-    ------
-    ContractError
-        No photo has a label; there are more groups than a contract holds; one has no printable
-        name.
-    """
-
-    of: Mapping[str, Sequence[str | None]]
-    source: str
+    of: Mapping[str, Sequence[str | None]]  # by attribute, the label of every photo
+    source: str  # in words, for the contract
 
     def __post_init__(self) -> None:
         groups = {(name, label) for name, column in self.of.items() for label in column if label}
@@ -86,20 +72,7 @@ class PeopleGroups:
 def people_groups(
     labels: PhotoLabels, photos: Indices, person_of: Indices, *, people: int
 ) -> tuple[PeopleGroups, ...]:
-    """Put people into groups; equal votes of their photos go to the group that comes first.
-
-    Parameters
-    ----------
-    photos : (N,) int64
-        Positions in the labels of the photos that are used.
-    person_of : (N,) int64
-        Their people, below ``people``.
-
-    Returns
-    -------
-    tuple of PeopleGroups
-        One per attribute that anybody has a label of.
-    """
+    """Put people into groups; equal votes of their photos go to the group that comes first."""
     groups = []
     for attribute, column in labels.of.items():
         own = [column[photo] for photo in photos]
@@ -152,13 +125,6 @@ def worst_group_threshold(
 
     A group is heeded where it has trials to *set* a threshold by, as for all of them together
     (``EXPECTED_ERRORS``); to be judged, a tenth of that is enough.
-
-    Returns
-    -------
-    threshold
-        The smallest such, not below the one that was given.
-    left_out
-        Groups whose impostor trials are too few, with their counts.
     """
     accepted = np.flatnonzero(impostors.scores >= np.float64(threshold))
     scores, pairs = impostors.scores[accepted], impostors.people_of(accepted)

@@ -49,13 +49,7 @@ def made_with(pack: ModelPack) -> str:
 
 
 def require_made_with(source: DecoySource, pack: ModelPack) -> None:
-    """Refuse decoys that are not, or do not say that they are, embeddings of this pack.
-
-    Raises
-    ------
-    ContractMismatch
-        They lie in another space than the embeddings that they are to hide, or may do so.
-    """
+    """Refuse decoys that are not, or do not say that they are, embeddings of this pack."""
     if source.made_with != made_with(pack):
         what = (
             "do not say which model they were made with"
@@ -104,13 +98,7 @@ class LikeSample:
 def make_generator(
     extraction: Extraction, pack: ModelPack, *, like: LikeSample | None = None
 ) -> DecoyGenerator:
-    """Fit the generator of decoys that belong to nobody to embeddings of the pack.
-
-    Raises
-    ------
-    PreparationError
-        Photos of ``like`` are also among those that are adapted to it.
-    """
+    """Fit the generator of decoys that belong to nobody to embeddings of the pack."""
     rows, made = extraction.embeddings, made_with(pack)
     if like is None:
         with single_threaded():
@@ -130,13 +118,7 @@ def make_generator(
 def make_pool(
     extraction: Extraction, labels: Mapping[Path, Attributes] | None, pack: ModelPack
 ) -> DecoyPool:
-    """Make a pool of real embeddings, labelled where labels are given.
-
-    Raises
-    ------
-    PreparationError
-        A photo has no label: hybrid+ could not tell what it is.
-    """
+    """Make a pool of real embeddings, labelled where labels are given."""
     if labels is None:
         return DecoyPool(extraction.embeddings, made_with=made_with(pack))
     labels_of_photos = [labels.get(path.resolve()) for path in extraction.paths]
@@ -158,13 +140,7 @@ def make_pool(
 
 
 def binding_for(pack: ModelPack, source: DecoySource, *, strategy: Strategy, m: int) -> Binding:
-    """Bind a pack, a decoy source and a way of lifting.
-
-    Raises
-    ------
-    ContractMismatch
-        The source says that it was made with another model or another preprocessing.
-    """
+    """Bind a pack, a decoy source and a way of lifting."""
     info = pack.info
     binding = Binding(
         embedder_sha256=info.embedder_sha256,

@@ -92,13 +92,7 @@ def best_grid_threshold(similarities: ArrayLike, same: ArrayLike) -> float:
 
 
 def require_folds(folds: NDArray[np.int64]) -> None:
-    """Check that every fold has a pair.
-
-    Raises
-    ------
-    ContractError
-        Where a fold is empty or a fold number is outside 0 … 9.
-    """
+    """Check that every fold has a pair."""
     if set(np.unique(folds).tolist()) != set(range(FOLDS)):
         raise ContractError(
             f"the ten-fold protocol needs pairs in each of {FOLDS} folds, numbered from 0, and "
@@ -110,20 +104,7 @@ def require_folds(folds: NDArray[np.int64]) -> None:
 def ten_fold(
     similarities: ArrayLike, same: ArrayLike, folds: ArrayLike, *, search: Search = best_threshold
 ) -> TenFold:
-    """Run the protocol.
-
-    Parameters
-    ----------
-    similarities, same, folds : array_like, shape (P,)
-        Of every pair: its similarity, whether it shows one person, and its fold, 0 … 9.
-    search
-        Finds the threshold on nine folds: the exact sweep, or the literature's grid.
-
-    Raises
-    ------
-    ContractError
-        Where a fold is empty or a fold number is outside 0 … 9.
-    """
+    """Run the protocol."""
     scores = np.asarray(similarities, dtype=np.float64)
     truth = np.asarray(same, dtype=np.bool_)
     numbers = np.asarray(folds, dtype=np.int64)
@@ -152,11 +133,6 @@ def random_pairs(
 
     Genuine pairs are distinct photos of one person, impostor pairs photos of two; as many of
     either, spread over the folds in turn.
-
-    Raises
-    ------
-    ContractError
-        Where there are fewer genuine pairs than folds, or one person only.
     """
     groups = [np.flatnonzero(person_of == person) for person in np.unique(person_of)]
     genuine = [

@@ -28,48 +28,24 @@ Array64 = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Impostors:
-    """Impostor trials of one calibration.
+    """Impostor trials of one calibration."""
 
-    Parameters
-    ----------
-    scores : (R,) float32
-        Minus infinity marks a cell that is no trial (a probe against its own person).
-    trials
-        Number of cells that are trials.
-    person_pairs
-        Number of distinct unordered pairs of people among the trials.
-    people_of
-        Maps (E,) positions in the arrays to the (E, 2) people of those trials.
-    weighted_trials
-        Total weight of all trials under (people,) bootstrap weights.
-    """
-
-    scores: Scores
+    scores: Scores  # (R,); minus infinity where a probe meets its own person, which is no trial
     trials: int
     people: int
-    person_pairs: int
-    people_of: Callable[[NDArray[np.int64]], NDArray[np.int64]]
-    weighted_trials: Callable[[Array64], float]
+    person_pairs: int  # distinct and unordered
+    people_of: Callable[[NDArray[np.int64]], NDArray[np.int64]]  # positions (E,) to people (E, 2)
+    weighted_trials: Callable[[Array64], float]  # their weight under (people,) bootstrap weights
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Genuine:
-    """Genuine trials.
+    """Genuine trials."""
 
-    Parameters
-    ----------
-    scores : (G,) float32
-    people : (G,) int64
-    enrolled_photos : (G,) int64
-        How many photos made each one's template.
-    refused : (G,) bool
-        Probes whose photos do not agree: the service refuses them before it compares.
-    """
-
-    scores: Scores
+    scores: Scores  # (G,), as all others
     people: NDArray[np.int64]
-    enrolled_photos: NDArray[np.int64]
-    refused: NDArray[np.bool_]
+    enrolled_photos: NDArray[np.int64]  # that made each one's template
+    refused: NDArray[np.bool_]  # photos that do not agree: the service does not compare them
 
 
 def resolved_targets(
@@ -186,13 +162,7 @@ def make_level(
 
 
 def level_name(target: float) -> str:
-    """Name of the level of a target: ``fmr-1e-3``.
-
-    Raises
-    ------
-    ContractError
-        Where the target is no power of ten below 1: two targets must not share a name.
-    """
+    """Name of the level of a target: ``fmr-1e-3``."""
     if 0 < target < 1:
         exponent = round(-math.log10(target))
         if exponent and math.isclose(target, 10.0**-exponent, rel_tol=1e-9):

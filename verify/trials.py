@@ -60,12 +60,6 @@ def plan_trials(
     A person with k ≥ 2 photos is enrolled on ``min(photos_per_enrollment, k - 1)`` of them,
     chosen at random, and probed by the others. A person with one photo is enrolled on it and
     gives impostor trials only.
-
-    Parameters
-    ----------
-    most_templates
-        Most people who are compared; those with two photos or more first, as they alone tell of
-        genuine probes: of people with one photo fewer templates are made. None for all.
     """
     if photos_per_enrollment < 1:
         raise ValueError("an enrollment needs at least one photo")
@@ -96,21 +90,11 @@ def plan_trials(
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ProbeSets:
-    """Photos that are averaged into probes.
+    """Photos that are averaged into probes."""
 
-    Parameters
-    ----------
-    photos : (P, k) int64
-        Of one person each.
-    genuine
-        The first so many hold no photo that is enrolled.
-    impostor : (R,) int64
-        Those that are compared with everybody else's template: all, or a random subset.
-    """
-
-    photos: Indices
-    genuine: int
-    impostor: Indices
+    photos: Indices  # (P, k), of one person each
+    genuine: int  # the first so many hold no photo that is enrolled
+    impostor: Indices  # (R,), those that are compared with everybody else's template
 
     def means(self, embeddings: NDArray[np.float32], rows: slice | Indices) -> NDArray[np.float32]:
         """Average and normalise the embeddings of some sets."""
@@ -185,20 +169,7 @@ def unit_means(embeddings: NDArray[np.float32]) -> NDArray[np.float32]:
 def chosen_photos(
     identities: Sequence[str], *, exclude: Collection[str]
 ) -> tuple[Indices, list[str]]:
-    """Leave out excluded people.
-
-    Parameters
-    ----------
-    exclude
-        Names to leave out, for instance those that a test uses.
-
-    Returns
-    -------
-    photos
-        Indices that stay.
-    names
-        Their people.
-    """
+    """Leave out excluded people: the positions of the other photos, and the names on them."""
     photos = [index for index, name in enumerate(identities) if name not in exclude]
     return np.asarray(photos, dtype=np.int64), [identities[index] for index in photos]
 

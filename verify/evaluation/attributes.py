@@ -22,21 +22,6 @@ def predict_attributes(embeddings: NDArray[np.float32], pool: DecoyPool) -> list
 
     hybrid+ needs the attributes of the faces it lifts; the paper predicts those of unlabelled
     faces. The vote is taken for each attribute by itself (:func:`voted`).
-
-    Parameters
-    ----------
-    embeddings : (N, n) float32
-        Unit rows.
-
-    Returns
-    -------
-    list of Attributes
-        One per row. An attribute that no entry has a label of is None.
-
-    Raises
-    ------
-    DecoyError
-        The pool has no labels.
     """
     entries, labels = pool.entries
     if labels is None:
@@ -52,20 +37,7 @@ def predict_attributes(embeddings: NDArray[np.float32], pool: DecoyPool) -> list
 def known_attributes(
     faces: EmbeddedSet, labels: Labels | None, decoys: Sequence[DecoySource]
 ) -> tuple[list[Attributes], int]:
-    """Gender and race of every embedded photo: as labelled, else predicted from the labelled pool.
-
-    Returns
-    -------
-    attributes
-        One for each row of embeddings.
-    predicted
-        How many were predicted.
-
-    Raises
-    ------
-    EvaluationError
-        A label is none that the pool knows.
-    """
+    """Gender and race of every row, as labelled or else predicted, and how many were predicted."""
     pool = next(source for source in decoys if isinstance(source, DecoyPool) and source.labelled)
     entries = pool.entries[1] or ()
     vocabulary = {
@@ -98,13 +70,6 @@ def voted(
     """Give each face the label that most of its nearest labelled entries have; None without any.
 
     Equal votes go to the label that comes first in the alphabet.
-
-    Parameters
-    ----------
-    embeddings, entries : (N, n) and (K, n) float32
-        Unit rows.
-    labels
-        One per entry; None where it has none.
     """
     known = [i for i, label in enumerate(labels) if label is not None]
     if not known or not len(embeddings):
@@ -124,13 +89,7 @@ def voted(
 def resembling_rows(
     rows: NDArray[np.float32], others: NDArray[np.float32], *, cosine: float
 ) -> NDArray[np.int64]:
-    """Find the rows that have a cosine of at least ``cosine`` with any of the others, ascending.
-
-    Parameters
-    ----------
-    rows, others : (N, n) and (M, n) float32
-        Unit rows; the cosines are made a tile at a time.
-    """
+    """Find the rows that have a cosine of at least ``cosine`` with any of the others, ascending."""
     resembles = np.zeros(len(rows), dtype=np.bool_)
     for start in range(0, len(rows), _ROWS):
         tile = rows[start : start + _ROWS]

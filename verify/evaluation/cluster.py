@@ -23,18 +23,7 @@ class ClusterError(VeilfaceError):
 
 @contextmanager
 def cluster(address: str) -> Iterator[Executor]:
-    """Connect to a Dask scheduler, and give its executor.
-
-    Parameters
-    ----------
-    address
-        Such as ``tcp://HOST:PORT``, or ``tls://`` with the certificates of Dask's configuration.
-
-    Raises
-    ------
-    ClusterError
-        No scheduler answers, it has no worker with this version of Veilface, or a worker ended.
-    """
+    """Connect to a Dask scheduler, and give its executor."""
     try:
         from distributed import Client
         from distributed.comm.core import CommClosedError

@@ -19,49 +19,22 @@ _TILE = 8192
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Trials:
-    """The pairs of a set of which both sides have an embedding, and what they are lifted with.
-
-    Parameters
-    ----------
-    name
-        Of the set.
-    embeddings : (N, n) float32
-        Unit rows.
-    mirrored : (N, n) float32, optional
-        The same with the mirror image added.
-    first, second : (P,) int64
-        Rows of each pair.
-    same : (P,) bool
-    folds : (P,) int64, optional
-        None where the protocol has none.
-    people : (2, P) int64, optional
-        People on both sides of each pair, where the set names people.
-    attributes
-        One per row, where hybrid+ is evaluated.
-    sources
-        Decoy sources, from which people of the set were removed.
-    kept : (P,) int64
-        Positions of the pairs in the set.
-    failed_genuine, failed_impostor
-        Pairs of the set that lack an embedding.
-    fta
-        Share of photos that gave none (ISO/IEC 19795-1).
-    """
+    """The pairs of a set of which both sides have an embedding, and what they are lifted with."""
 
     name: str
-    embeddings: NDArray[np.float32]
-    mirrored: NDArray[np.float32] | None
-    first: NDArray[np.int64]
+    embeddings: NDArray[np.float32]  # (N, n) unit rows
+    mirrored: NDArray[np.float32] | None  # the same with the mirror image added
+    first: NDArray[np.int64]  # (P,) rows, as `second`
     second: NDArray[np.int64]
     same: NDArray[np.bool_]
-    folds: NDArray[np.int64] | None
-    people: NDArray[np.int64] | None
-    attributes: Sequence[Attributes] | None
-    sources: tuple[Source, ...]
-    kept: NDArray[np.int64]
-    failed_genuine: int = 0
+    folds: NDArray[np.int64] | None  # None where the protocol has none
+    people: NDArray[np.int64] | None  # (2, P), where the set names people
+    attributes: Sequence[Attributes] | None  # one per row, for hybrid+
+    sources: tuple[Source, ...]  # decoys, from which people of the set were removed
+    kept: NDArray[np.int64]  # (P,) positions of the pairs in the set
+    failed_genuine: int = 0  # pairs of the set that lack an embedding
     failed_impostor: int = 0
-    fta: float = 0.0
+    fta: float = 0.0  # share of photos that gave none (ISO/IEC 19795-1)
 
     def __len__(self) -> int:
         return len(self.same)
@@ -90,11 +63,6 @@ def compare(
         of each pair was lifted (first, second, both or None).
     similarities : (P,) float64
         1 − d²/2.
-
-    Raises
-    ------
-    LiftingError, DecoyError
-        The decoys do not suffice for the strategy.
     """
     names: Json = {
         "strategy": unit.strategy,

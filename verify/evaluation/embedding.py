@@ -25,31 +25,15 @@ Progress = Callable[[str, int], AbstractContextManager[Advance]]
 
 @dataclass(frozen=True, eq=False, repr=False)
 class EmbeddedSet:
-    """A set with the embeddings of its photos.
-
-    Parameters
-    ----------
-    embeddings : (k, n) float32
-        Unit rows of the photos that were acquired.
-    rows : (len(pictures),) int64
-        Row of each photo; -1 where it failed.
-    failures
-        The others, with the reason; ``path`` is the photo's name.
-    mirrored : (k, n) float32, optional
-        The same rows with the mirror image added.
-    aligned
-        Whether the photos were taken for aligned crops; None where they were not embedded here.
-    pictures_sha256
-        Of all photos; empty where they were not read.
-    """
+    """A set with the embeddings of its photos."""
 
     pairs: VerificationSet
-    embeddings: NDArray[np.float32]
-    rows: Indices
-    failures: tuple[Failure, ...]
-    mirrored: NDArray[np.float32] | None = None
-    aligned: bool | None = None
-    pictures_sha256: str = ""
+    embeddings: NDArray[np.float32]  # (k, n) unit rows
+    rows: Indices  # of each photo; -1 where it failed
+    failures: tuple[Failure, ...]  # the others; ``path`` is the photo's name
+    mirrored: NDArray[np.float32] | None = None  # the same rows with the mirror image added
+    aligned: bool | None = None  # None where the photos were not embedded here
+    pictures_sha256: str = ""  # of all photos; empty where they were not read
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,20 +69,12 @@ class FileEmbedder:
 
 @dataclass(frozen=True, eq=False)
 class PackEmbedder:
-    """A model pack.
-
-    Parameters
-    ----------
-    mirrored
-        Whether embeddings with the mirror image are wanted beside those without.
-    aligned
-        Whether the photos are aligned crops; None to see for each set.
-    """
+    """A model pack."""
 
     pack: ModelPack
     facts: Json
-    mirrored: bool
-    aligned: bool | None
+    mirrored: bool  # whether embeddings with the mirror image are wanted too
+    aligned: bool | None  # None to see for each set
 
     @property
     def model(self) -> Model:
@@ -109,13 +85,7 @@ class PackEmbedder:
     def embed(
         self, pairs: VerificationSet, *, cache: EmbeddingCache | None, progress: Progress
     ) -> EmbeddedSet:
-        """Embed the photos of a set, equal ones once; those that fail are counted.
-
-        Raises
-        ------
-        EvaluationError
-            Nothing can align the photos.
-        """
+        """Embed the photos of a set, equal ones once; those that fail are counted."""
         contents = digests(pairs)
         aligned = self._aligned(pairs)
         # By content, so that copies are embedded once.

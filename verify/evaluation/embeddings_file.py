@@ -23,18 +23,10 @@ _TELLING = {"bin": 1, "lfw": 1, "agedb": 1, "cfp": 3}
 
 @dataclass(frozen=True, eq=False, repr=False)
 class EmbeddingsFile:
-    """Embeddings with the paths of their photos.
+    """Embeddings with the paths of their photos."""
 
-    Parameters
-    ----------
-    paths
-        As the file has them, all different.
-    embeddings : (N, n) float32
-        Unit rows.
-    """
-
-    paths: tuple[str, ...]
-    embeddings: NDArray[np.float32]
+    paths: tuple[str, ...]  # as the file has them, all different
+    embeddings: NDArray[np.float32]  # (N, n) unit rows
     sha256: str
 
     def __len__(self) -> int:
@@ -45,12 +37,6 @@ def read_embeddings(file: Path) -> EmbeddingsFile:
     """Read an ``.npz`` with ``paths`` (N unicode strings) and ``descriptors`` (N, n).
 
     Rows are normalised, as many tools save what the network gave.
-
-    Raises
-    ------
-    DatasetError
-        The archive is broken or too large, an array has another type or shape, a row is zero or
-        not finite, or a path occurs twice.
     """
     return isolated(read_content, file)
 
@@ -105,17 +91,7 @@ def match(file: EmbeddingsFile, benchmark: VerificationSet) -> NDArray[np.int64]
     A photo takes the row of its exact name; else the row whose path ends, suffixes aside, in as
     many components of its own as tell photos of the set apart (``Name_0001`` in LFW,
     ``001/frontal/01`` in CFP, all of them in a pair CSV). Photos of a ``.bin`` are ``00000``,
-    ``00001`` … by place.
-
-    Returns
-    -------
-    positions : (len(benchmark.pictures),) int64
-        Rows of ``file.embeddings``; −1 for photos without one, which are failures to acquire.
-
-    Raises
-    ------
-    DatasetError
-        Several rows fit a photo.
+    ``00001`` … by place. -1 stands for a photo without one, which failed to be acquired.
     """
     exact = {path: [row] for row, path in enumerate(file.paths)}
     ends: defaultdict[tuple[str, ...], list[int]] = defaultdict(list)

@@ -46,18 +46,12 @@ ARRAYS = ["similarities", "curve", "replicates"]
 
 @dataclass(frozen=True, eq=False)
 class SetResult:
-    """One set, the pairs that were compared, and the decoys as they were used on it.
-
-    Parameters
-    ----------
-    predicted
-        Photos whose attributes were predicted; None without hybrid+.
-    """
+    """One set, the pairs that were compared, and the decoys as they were used on it."""
 
     faces: EmbeddedSet
     trials: Trials
     sources: Sequence[SourceFacts]
-    predicted: int | None
+    predicted: int | None  # photos whose attributes were predicted; None without hybrid+
 
 
 def evaluate(
@@ -72,24 +66,9 @@ def evaluate(
     note: Note,
     progress: Progress,
 ) -> tuple[pd.DataFrame, list[SetResult]]:
-    """Evaluate a plan on any number of sets.
+    """Evaluate a plan on any number of sets; returns the runs of :func:`run_trials` and the rest.
 
-    Parameters
-    ----------
-    executor
-        Where units of work are computed: threads, processes or a cluster.
-
-    Returns
-    -------
-    runs
-        As of :func:`run_trials`, of all sets.
-    results
-        What there is to know of each set besides.
-
-    Raises
-    ------
-    EvaluationError
-        No photo of a set gave an embedding, or every decoy resembles one of its people.
+    The executor computes the units of work: threads, processes or a cluster.
     """
     embedded = [
         _embedded(embedder, pairs, cache=cache, note=note, progress=progress) for pairs in sets
@@ -155,13 +134,7 @@ def averaged(faces: EmbeddedSet, templates: Sequence[Sequence[int]]) -> Embedded
 def trials_of(
     faces: EmbeddedSet, *, attributes: Sequence[Attributes] | None, sources: tuple[Source, ...]
 ) -> Trials:
-    """Take the pairs of which both photos gave an embedding; the others are counted.
-
-    Raises
-    ------
-    DatasetError
-        Too few pairs are left.
-    """
+    """Take the pairs of which both photos gave an embedding; the others are counted."""
     pairs = faces.pairs
     first, second = faces.rows[pairs.first], faces.rows[pairs.second]
     kept = np.flatnonzero((first >= 0) & (second >= 0))
@@ -278,13 +251,7 @@ def _add_curves(trials: Trials, runs: Sequence[Json]) -> None:
 def group_rates(
     runs: pd.DataFrame, results: Sequence[SetResult], labels: Labels, plan: EvaluationPlan
 ) -> tuple[list[Json], list[Json]]:
-    """Count errors by group at the threshold that holds for all, in every row and target.
-
-    Returns
-    -------
-    groups, summaries
-        Entries for each group, and one for all groups of an attribute together.
-    """
+    """Count errors by group at the threshold that holds for all, in every row and target."""
     groups: list[Json] = []
     summaries: list[Json] = []
     exact = runs[runs["threshold_search"] == "exact"]

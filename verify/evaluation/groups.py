@@ -31,13 +31,6 @@ def least_of_highest(errors: float, trials: int, *, groups: int) -> float:
 def mean_rate(errors: float, trials: int) -> Json:
     """Error rate over one or several runs on the same trials.
 
-    Parameters
-    ----------
-    errors
-        Mean over the runs of the errors of one run; a whole number where there was one run.
-    trials
-        Trials of one run.
-
     Returns
     -------
     value
@@ -64,19 +57,6 @@ def by_group(
     target_fmr: float,
 ) -> tuple[list[Json], Json]:
     """Count the errors of each group.
-
-    Parameters
-    ----------
-    similarities
-        Of one or several runs, each (P,), on the same pairs; no failed pair among them.
-    same : (P,) bool
-        Whether a pair shows one person.
-    first_labels, second_labels
-        Label of each photo of each pair, None where it has none.
-    thresholds
-        The threshold of each run, set on all its trials; a pair at or above it matches.
-    target_fmr
-        The target of the threshold on all impostor trials.
 
     Returns
     -------

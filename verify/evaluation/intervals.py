@@ -58,13 +58,7 @@ def fmr_grid(impostor_pairs: int) -> Array64:
 
 
 class OperatingPoints:
-    """FNMR at FMR targets, for the trials as they are or weighted.
-
-    Parameters
-    ----------
-    genuine, impostor : (G,), (I,) float64
-        Similarities of genuine and impostor trials.
-    """
+    """FNMR at FMR targets, for the trials as they are or weighted."""
 
     def __init__(self, genuine: Array64, impostor: Array64) -> None:
         self._genuine_order = np.argsort(genuine, kind="stable")
@@ -87,11 +81,7 @@ class OperatingPoints:
     ) -> Array64:
         """FNMR, (F,), at the lowest threshold whose FMR is at most each of ``fmrs``.
 
-        Parameters
-        ----------
-        fmrs : (F,) float64
-        genuine, impostor : (G,), (I,) float64, optional
-            Whole-numbered weights of the trials; 1 each by default.
+        The trials may have whole-numbered weights.
         """
         genuine_weights = np.ones(self._genuine_order.size) if genuine is None else genuine
         impostor_weights = np.ones(self._impostor_order.size) if impostor is None else impostor

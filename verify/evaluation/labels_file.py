@@ -24,16 +24,10 @@ _NO_ATTRIBUTE = "service_test"
 
 @dataclass(frozen=True, repr=False)
 class Labels:
-    """What a label file says.
-
-    Parameters
-    ----------
-    of
-        By the path or name of a row, and by that without suffix: its labels by attribute. An empty
-        cell is absent.
-    """
+    """What a label file says."""
 
     attributes: tuple[str, ...]
+    # By the path or name of a row, and by that without suffix; an empty cell is absent.
     of: Mapping[str, Mapping[str, str]]
 
     def __repr__(self) -> str:
@@ -68,12 +62,6 @@ def read_labels(file: Path | str) -> Labels:
 
     Ages in years are put into groups (`age_group`). Those of FairFace that a spreadsheet made dates
     of are repaired.
-
-    Raises
-    ------
-    DatasetError
-        Naming the first fault with its line: no such columns, wrong numbers of cells, a row without
-        a path, two rows of one path that differ, an attribute with too many labels.
     """
     path = Path(file)
     rows = csv_rows(path, decoded(read_whole(path, most=MAX_BYTES), file=path), required=())

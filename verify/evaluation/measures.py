@@ -22,15 +22,6 @@ def measure(
 ) -> Json:
     """Measure one run.
 
-    Parameters
-    ----------
-    similarities, same, folds : (P,)
-        Of every pair. Without folds there is no accuracy.
-    targets
-        FMR targets; those that the impostor pairs cannot resolve are left out.
-    search
-        ``exact``, or ``grid``, the literature's search for raw embeddings.
-
     Returns
     -------
     accuracies, thresholds

@@ -59,11 +59,6 @@ class EvaluationPlan:
         Of the spherical iteration.
     device
         Of torch, for subspace-to-subspace distances; None for the processor.
-
-    Raises
-    ------
-    EvaluationError
-        A name, a dimension or a target that there is not; or nothing to evaluate.
     """
 
     strategies: tuple[str, ...]
@@ -101,21 +96,11 @@ class EvaluationPlan:
 
 @dataclass(frozen=True)
 class Unit:
-    """One lifting of both sides of all pairs, compared in every mode and metric of the plan.
-
-    Parameters
-    ----------
-    strategy
-        Of ``STRATEGIES``; raw embeddings are not lifted, and have neither ``m`` nor a seed.
-    m
-        Dimension of the subspaces; 0 for raw embeddings.
-    source
-        Position of the decoy source among those of the evaluation; None without decoys.
-    """
+    """One lifting of both sides of all pairs, compared in every mode and metric of the plan."""
 
     strategy: str
-    m: int = 0
-    source: int | None = None
+    m: int = 0  # 0 for raw embeddings, which have no seed either
+    source: int | None = None  # position among the decoy sources
     seed: int | None = None
 
     @property
@@ -136,13 +121,7 @@ def default_strategies(sources: Sequence[Source], *, raw_flip: bool) -> tuple[st
 
 
 def units_of(plan: EvaluationPlan, sources: Sequence[Source], *, n: int) -> list[Unit]:
-    """List the units of work, long ones first.
-
-    Raises
-    ------
-    EvaluationError
-        A strategy lacks the decoys that it needs, or a dimension does not fit.
-    """
+    """List the units of work, long ones first."""
     units: list[Unit] = []
     for name in plan.strategies:
         if name in (RAW, RAW_FLIP):

@@ -14,19 +14,11 @@ _LIBRARIES = ("numpy", "scipy", "onnxruntime", "opencv-python-headless")
 
 @dataclass(frozen=True)
 class Model:
-    """Where embeddings came from.
-
-    Parameters
-    ----------
-    facts
-        For the reader: pack, detector, or file of embeddings with its SHA-256.
-    embedder_sha256, preprocessing
-        As in a contract; None where embeddings came from a file.
-    """
+    """Where embeddings came from."""
 
     n: int
-    facts: Json
-    embedder_sha256: str | None = None
+    facts: Json  # pack and detector, or file of embeddings with its SHA-256
+    embedder_sha256: str | None = None  # None where embeddings came from a file
     preprocessing: Mapping[str, Any] | None = None
 
     def json(self) -> Json:

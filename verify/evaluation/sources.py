@@ -18,15 +18,9 @@ two people of LFW 54 reach it, and some of those are one person under two names.
 
 @dataclass(frozen=True, eq=False)
 class SourceFacts:
-    """A decoy source and the file it came from.
+    """A decoy source and the file it came from."""
 
-    Parameters
-    ----------
-    source
-        As it is in the file; for a set, without the entries that resemble its people.
-    """
-
-    source: Source
+    source: Source  # for a set, without the entries that resemble its people
     file: str
     sha256: str
     left_out: int = 0
@@ -49,11 +43,6 @@ def without_test_people(
 
     A person who was not acquired, or resembles their own photos less than ``SAME_PERSON``, stays
     in; :func:`resemblance` says how many genuine pairs that concerns.
-
-    Raises
-    ------
-    EvaluationError
-        None is left.
     """
     kept = []
     for facts in sources:

@@ -16,45 +16,20 @@ Flags = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False, repr=False)
 class VerificationSet:
-    """Pairs of photos, or of templates of several photos each, as their protocol has them.
-
-    Parameters
-    ----------
-    name
-        Short name for tables, such as ``lfw`` or ``cfp_fp``.
-    kind
-        What was read: ``bin``, ``lfw``, ``cfp``, ``agedb`` or ``pairs``.
-    pictures
-        The photos that pairs use, each once, in the order of their first use.
-    first, second : (P,) int64
-        Positions in ``pictures``, or in ``templates`` where there are such.
-    same : (P,) bool
-        Whether a pair shows one person.
-    folds : (P,) int64, optional
-        0 … 9; None where the protocol has none, and so no accuracy.
-    people
-        Name of the person on each of ``pictures`` (of ``templates``), or None where the set does
-        not tell.
-    protocol_files
-        Names and SHA-256 of the files that define the pairs, such as ``pairs.txt``.
-    aligned
-        True where the format promises aligned crops (``.bin``), else None: not known.
-    templates
-        Positions of the photos of each template, in protocols that compare the mean embedding of
-        several, as IJB-C does; None where photos are compared.
-    """
+    """Pairs of photos, or of templates of several photos each, as their protocol has them."""
 
     name: str
-    kind: str
-    pictures: tuple[Photo, ...]
-    first: Indices
+    kind: str  # bin, lfw, cfp, agedb or pairs
+    pictures: tuple[Photo, ...]  # each once, in the order of their first use
+    first: Indices  # (P,) positions in ``pictures``, or in ``templates`` where there are such
     second: Indices
-    same: Flags
-    folds: Indices | None
-    people: tuple[str, ...] | None = None
-    protocol_files: tuple[tuple[str, str], ...] = ()
-    aligned: bool | None = None
+    same: Flags  # (P,)
+    folds: Indices | None  # 0 … 9; None where the protocol has none, and so no accuracy
+    people: tuple[str, ...] | None = None  # on each of ``pictures`` (of ``templates``)
+    protocol_files: tuple[tuple[str, str], ...] = ()  # names and SHA-256
+    aligned: bool | None = None  # True where the format promises aligned crops
     templates: tuple[tuple[int, ...], ...] | None = None
+    """Positions of the photos whose mean is compared, in protocols such as IJB-C's."""
 
     def __len__(self) -> int:
         return len(self.same)
@@ -91,13 +66,7 @@ def contiguous_folds(pairs: int) -> Indices:
 
 
 def require_both_classes(name: str, same: Flags, folds: Indices | None) -> None:
-    """Check that there are pairs of one person and pairs of two, in every fold if there are folds.
-
-    Raises
-    ------
-    DatasetError
-        Naming the folds that lack either: most often the pairs are sorted by class, or cut off.
-    """
+    """Check that there are pairs of one person and pairs of two, in every fold where there are."""
     if folds is None:
         if same.all() or not same.any():
             people = "two people" if same.any() else "one person"

@@ -156,13 +156,7 @@ def _look(number: int) -> Look:
 
 
 def draw_det(axes: Axes, curves: Sequence[tuple[Row, Look]], x: str, y: str) -> None:
-    """Draw the rate ``fnmr`` of each curve over its ``fmr``, with the band from low to high.
-
-    Parameters
-    ----------
-    x, y
-        Names of the two rates.
-    """
+    """Draw the rate ``fnmr`` of each curve over its ``fmr``, with the band from low to high."""
     drawn = []
     for place, (curve, look) in enumerate(curves):
         # A rate of 0 has no deviate: the line leaves the panel through its foot.

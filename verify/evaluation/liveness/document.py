@@ -50,16 +50,7 @@ def document(
     unverified: str | None,
     refused: Sequence[str],
 ) -> Json:
-    """Put everything together.
-
-    Parameters
-    ----------
-    verified
-        Decisions of the whole verification; None where they were not measured, and ``unverified``
-        says why.
-    refused
-        Why operating points that were asked for are not there.
-    """
+    """Put everything together."""
     presented = scored.presented
     species = [name for name in presented.species if len(scored.scored(name))]
     live = scored.scored(None)

@@ -18,39 +18,21 @@ _NUMBERED = re.compile(r"([0-9]{2,})_")
 
 @dataclass(frozen=True)
 class Presentation:
-    """One photo of what was held before a camera.
-
-    Parameters
-    ----------
-    name
-        Its path relative to the set.
-    species
-        Of the attack instrument, such as ``print``; None for a live face.
-    subject
-        Whose face it shows; None where that is not known.
-    """
+    """One photo of what was held before a camera."""
 
     path: Path
-    name: str
-    species: str | None
-    subject: str | None
+    name: str  # path relative to the set
+    species: str | None  # of the attack instrument, such as print; None for a live face
+    subject: str | None  # None where that is not known
 
 
 @dataclass(frozen=True)
 class PresentationSet:
-    """Live and attack photos.
-
-    Parameters
-    ----------
-    name, kind
-        Of the folder or file; ``folder`` or ``csv``.
-    presentations
-        Live ones first, then by species and name.
-    """
+    """Live and attack photos."""
 
     name: str
-    kind: str
-    presentations: tuple[Presentation, ...]
+    kind: str  # folder or csv
+    presentations: tuple[Presentation, ...]  # live ones first, then by species and name
 
     @property
     def species(self) -> tuple[str, ...]:
@@ -69,11 +51,6 @@ def read_presentations(path: Path, *, attacks: bool) -> PresentationSet:
 
     Where the name of every photo of a folder begins with a number and an underscore, as in NUAA
     (``0001_00_…``), that number is the subject's.
-
-    Raises
-    ------
-    DatasetError
-        Naming the first fault.
     """
     try:
         if path.is_dir():

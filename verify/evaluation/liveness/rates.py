@@ -22,11 +22,6 @@ def threshold_at_bpcer(live: ArrayLike, target: float) -> float:
     """Highest threshold whose BPCER on these live scores is at most the target.
 
     It lies halfway between the last score that is rejected and the first that passes.
-
-    Raises
-    ------
-    DatasetError
-        Where so few live photos cannot resolve the target.
     """
     scores = np.asarray(live, dtype=np.float64)
     if not resolvable(target, scores.size):
@@ -56,13 +51,7 @@ def non_response(scored: ScoredSet, species: str | None) -> Rate:
 def calibrate_liveness(
     scored: ScoredSet, graphs: Sequence[str], *, target: float
 ) -> LivenessCalibration:
-    """Set the threshold at a stated BPCER, and count both errors there.
-
-    Raises
-    ------
-    DatasetError
-        Where the live photos cannot resolve the target.
-    """
+    """Set the threshold at a stated BPCER, and count both errors there."""
     threshold = threshold_at_bpcer(scored.scored(None), target)
     return LivenessCalibration(
         graphs=tuple(graphs),

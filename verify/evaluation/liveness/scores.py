@@ -24,12 +24,7 @@ LEAST_PEOPLE = 5
 
 
 def share(errors: Flags, subjects: Sequence[str | None]) -> Rate:
-    """Rate of errors; its interval resamples people where they are known, as photos share them.
-
-    Parameters
-    ----------
-    errors : (k,) bool
-    """
+    """Rate of errors; its interval resamples people where they are known, as photos share them."""
     people, codes = np.unique([name or "" for name in subjects], return_inverse=True)
     if None in subjects or len(people) < LEAST_PEOPLE:
         return rate(int(np.count_nonzero(errors)), len(errors))
@@ -45,19 +40,11 @@ def share(errors: Flags, subjects: Sequence[str | None]) -> Rate:
 
 @dataclass(frozen=True, eq=False)
 class ScoredSet:
-    """A set of presentations with their scores.
-
-    Parameters
-    ----------
-    scores : (k,) float64
-        NaN where no face was acquired.
-    embeddings : (k, n) float32
-        Of the same faces; undefined where no face was acquired.
-    """
+    """A set of presentations with their scores."""
 
     presented: PresentationSet
-    scores: Array64 = field(repr=False)
-    embeddings: NDArray[np.float32] = field(repr=False)
+    scores: Array64 = field(repr=False)  # (k,); NaN where no face was acquired
+    embeddings: NDArray[np.float32] = field(repr=False)  # (k, n)
     failures: tuple[Failure, ...]
 
     @property
@@ -87,26 +74,17 @@ class ScoredSet:
 
 @dataclass(frozen=True, eq=False)
 class VerifiedSet:
-    """Decisions on photos whose subject is enrolled, each against that subject's template.
-
-    Parameters
-    ----------
-    matched, tried : (k,) bool
-        Whether a photo was accepted, and whether it was shown at all: photos of people who are
-        not enrolled, and those that people were enrolled by, are not. One without a face is
-        shown, and not accepted.
-    left_out
-        Subjects who were not enrolled: too few live photos with a face, or they do not agree.
-    """
+    """Decisions on photos whose subject is enrolled, each against that subject's template."""
 
     scored: ScoredSet
-    matched: Flags = field(repr=False)
+    matched: Flags = field(repr=False)  # (k,)
+    # (k,): of people who are enrolled, and not by this photo. One without a face is shown too.
     tried: Flags = field(repr=False)
     level: str
     target_fmr: float | None
     enrolled_photos: int
     enrolled: int
-    left_out: tuple[str, ...]
+    left_out: tuple[str, ...]  # subjects of too few live photos, or of some that do not agree
 
     def accepted(self, threshold: float | None) -> Flags:
         """Whether the whole verification accepts, (k,); by the comparison alone where None."""
@@ -129,13 +107,7 @@ def score_set(
     *,
     progress: Callable[[int], None] = lambda _: None,
 ) -> ScoredSet:
-    """Score every photo: the large central face of the frame, without the photo gate.
-
-    Raises
-    ------
-    PackError
-        If the pack has no liveness graph.
-    """
+    """Score every photo: the large central face of the frame, without the photo gate."""
 
     def sample(presentation: Presentation) -> FaceSample | Failure:
         try:

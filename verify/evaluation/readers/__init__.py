@@ -20,19 +20,7 @@ def _readers() -> list[Reader]:
 
 
 def open_sets(path: Path, *, pictures: bool = True) -> list[VerificationSet]:
-    """Read the verification sets at ``path``; a CFP folder holds two.
-
-    Parameters
-    ----------
-    pictures
-        Whether the photos themselves must be there. They need not be where embeddings were
-        computed elsewhere; their names are then those of the protocol.
-
-    Raises
-    ------
-    DatasetError
-        Saying what was seen and what is understood, or what is wrong with the set.
-    """
+    """Read the verification sets at ``path``; a CFP folder holds two."""
     readers = _readers()
     understood = f"Understood are: {'; '.join(reader.layout for reader in readers)}"
     try:

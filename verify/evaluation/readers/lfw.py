@@ -22,11 +22,6 @@ def read_lfw(root: Path, pictures: bool) -> list[VerificationSet]:
 
     The people's folders lie beside ``pairs.txt`` or in one folder beside it, such as ``lfw/``.
 
-    Raises
-    ------
-    DatasetError
-        The protocol is broken, or photos that it names are absent; all are listed.
-
     References
     ----------
     Huang, Ramesh, Berg, Learned-Miller, "Labeled Faces in the Wild", UMass TR 07-49, 2007.

@@ -43,21 +43,11 @@ _NAME = re.compile(r"\w[\w .()-]{0,99}")
 
 @dataclass(frozen=True)
 class Reader:
-    """How one kind of data set is read.
+    """How one kind of data set is read."""
 
-    Parameters
-    ----------
-    layout
-        For the message that says what is understood.
-    recognises
-        Whether a path, which is there, holds such a set.
-    read
-        Gives the sets at a path. ``pictures`` says whether the photos themselves must be there;
-        they need not be where embeddings were computed elsewhere.
-    """
-
-    layout: str
+    layout: str  # in the message that says what is understood
     recognises: Callable[[Path], bool]
+    # The second argument says whether the photos must be there.
     read: Callable[[Path, bool], list[VerificationSet]]
 
 
@@ -157,15 +147,7 @@ def assemble(
     aligned: bool | None = None,
     templates: Mapping[str, Sequence[Photo]] | None = None,
 ) -> VerificationSet:
-    """Number the photos of ``trials`` and check that every fold has both kinds of pairs.
-
-    Parameters
-    ----------
-    pictures, person
-        The photo of a key, and the name of the person on it.
-    templates
-        Photos of the keys that stand for several.
-    """
+    """Number the photos of ``trials`` and check that every fold has both kinds of pairs."""
     if not _NAME.fullmatch(name):
         raise DatasetError(
             f"the set {name[:100]!a} has a name of more than 100 characters, or of others than "
