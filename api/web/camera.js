@@ -1,5 +1,5 @@
 // The camera, with live guidance: about one small frame a second is asked about, and slower where the service
-// says so. The photos that count are taken at full size, a burst of three, and each is asked about meanwhile.
+// says so. The photos that count are taken at full size, a burst of three.
 
 import { faceBox, h, s } from "./dom.js";
 import { Problem, call, crops, form, session } from "./service.js";
@@ -82,13 +82,12 @@ export function viewfinder(...overlays) {
   };
 }
 
-// `burst()` resolves to the photos that would do, as {blob, name, seen}: `seen` is what the service saw, or null where
-// it could not be asked. `face()` says which face counts; `onchange` is called where the camera goes on or off.
+// `burst()` resolves to photos, as {blob, name}. `face()` says which face counts; `onchange` is called where the camera
+// goes on or off.
 export function camera({ face, onchange }) {
   const { overlay, mark } = faceBox();
   const finder = viewfinder(overlay);
   const guide = h("p", { class: "guidance", role: "status", "data-state": "idle" }, "The camera is off.");
-  const refused = h("p", { class: "refused", role: "status" });
   let running = new AbortController();
   running.abort();
   let taking = false;
@@ -103,7 +102,6 @@ export function camera({ face, onchange }) {
     running.abort();
     running = new AbortController();
     const { signal } = running;
-    refused.textContent = "";
     try {
       await finder.open(signal, lost);
     } catch (error) {
@@ -146,47 +144,26 @@ export function camera({ face, onchange }) {
   // Packs without a detector take aligned crops, which are square.
   const snap = (side, quality) => finder.shot({ side, quality, square: crops() });
 
-  // Why a photo would not do, or null.
-  async function judge(photo, signal) {
-    try {
-      photo.seen = await check(photo.blob, face(), signal);
-      return photo.seen.usable ? null : guidance(photo.seen);
-    } catch (error) {
-      if (!(error instanceof Problem)) throw error;
-      return unasked(error) ? null : sentence(error.message);
-    }
-  }
-
   async function burst() {
     const { signal } = running;
+    const photos = [];
     taking = true;
-    refused.textContent = "";
     say("Hold still…", "idle");
-    const good = [];
-    let why = null;
     try {
-      const judged = [];
       for (let shot = 0; shot < BURST; shot++) {
         if (shot) await after(APART_MS);
         signal.throwIfAborted();
-        const photo = { blob: (await snap(PHOTO, QUALITY)).blob, name: "camera", seen: null };
-        const before = judged.at(-1);
-        judged.push(Promise.resolve(before).then(() => judge(photo, signal)).then((reason) => {
-          if (reason) why ??= reason;
-          else good.push(photo);
-        }));
+        photos.push({ blob: (await snap(PHOTO, QUALITY)).blob, name: "camera" });
       }
-      await Promise.all(judged);
+      say("Looking for a face…", "idle");
+      return photos;
     } catch (error) {
-      if (!signal.aborted && !(error instanceof Problem)) throw error;
-      why = sentence(error.message);
+      if (signal.aborted) return [];
+      say(sentence(error.message), "bad");
+      return [];
     } finally {
       taking = false;
     }
-    if (signal.aborted) return [];
-    say(why ? "Looking for a face…" : "Photos taken.", "idle");
-    if (why) refused.textContent = `${good.length || "None"} of ${BURST} photos taken. ${why}`;
-    return good;
   }
 
   function lost() {
@@ -196,6 +173,5 @@ export function camera({ face, onchange }) {
   }
 
   finder.root.append(guide);
-  const root = h("div", { class: "camera" }, finder.root, refused);
-  return { root, begin, burst, isOn: () => !running.signal.aborted && finder.isOn(), stop: () => running.abort() };
+  return { root: finder.root, begin, burst, isOn: () => !running.signal.aborted && finder.isOn(), stop: () => running.abort() };
 }

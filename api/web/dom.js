@@ -36,20 +36,11 @@ export function field(label, control, hint) {
   return h("div", { class: "field" }, parts);
 }
 
-// One of several: radio buttons in a row. `choices` has a label by each value; `off` those that cannot be chosen.
-export function choice(legend, choices, { value, onchange, off = [], describedby }) {
+// One of several: radio buttons in a row. `choices` has a label by each value.
+export function choice(legend, choices, { value, onchange }) {
   const name = newId("choice");
   const radios = Object.keys(choices).map((each) =>
-    h("input", {
-      type: "radio",
-      name,
-      id: newId("choice"),
-      value: each,
-      checked: each === value,
-      disabled: off.includes(each),
-      "aria-describedby": off.includes(each) ? describedby : null,
-      onchange: () => onchange(each),
-    }),
+    h("input", { type: "radio", name, id: newId("choice"), value: each, checked: each === value, onchange: () => onchange(each) }),
   );
   const root = h(
     "fieldset",
@@ -57,29 +48,7 @@ export function choice(legend, choices, { value, onchange, off = [], describedby
     h("legend", {}, legend),
     radios.map((radio) => h("span", {}, radio, h("label", { for: radio.id }, choices[radio.value]))),
   );
-  return {
-    root,
-    value: () => radios.find((radio) => radio.checked).value,
-    choose: (each) => (radios.find((radio) => radio.value === each).checked = true),
-  };
-}
-
-// A place to choose a file, or to drop one on, for an input whose own looks are hidden.
-export function dropZone(input, title, hint) {
-  const name = h("strong", {}, title);
-  const over = (event) => {
-    event.preventDefault();
-    event.stopPropagation();
-  };
-  const show = () => (name.textContent = input.files[0]?.name ?? title);
-  input.addEventListener("change", show);
-  const drop = (event) => {
-    over(event);
-    input.files = event.dataTransfer.files;
-    show();
-  };
-  const zone = { class: "drop", for: input.id, ondragover: over, ondrop: drop };
-  return [input, h("label", zone, name, h("span", { class: "hint" }, hint))];
+  return { root, value: () => radios.find((radio) => radio.checked).value };
 }
 
 // A box around a face, over a picture that fills its frame.
@@ -167,25 +136,15 @@ export const percent = (rate) =>
 
 export const oneIn = (rate) => (rate > 0 ? `1 in ${Math.round(1 / rate).toLocaleString("en")}` : "none seen");
 
-function ago(time) {
-  const seconds = Math.round((Date.now() - time) / 1000);
-  const units = [["d", 86400], ["h", 3600], ["min", 60], ["s", 1]];
-  const [unit, size] = units.find(([, size]) => seconds >= size) ?? ["s", 1];
-  if (seconds < 5) return "just now";
-  return seconds < 30 * 86400 ? `${Math.floor(seconds / size)} ${unit} ago` : null;
-}
-
-// A time to the second, and where it is recent how long ago that was; `brief`: that alone.
+// A time to the second; `brief`: to the day.
 export function when(text, { brief = false } = {}) {
   const time = new Date(text);
-  const exact = time.toLocaleString("en-GB", { dateStyle: "medium", timeStyle: "medium" });
-  const since = ago(time);
-  const shown = brief ? (since ?? exact) : since ? `${exact} · ${since}` : exact;
-  return h("time", { datetime: text, title: exact }, shown);
+  const shown = time.toLocaleString("en-GB", brief ? { dateStyle: "medium" } : { dateStyle: "medium", timeStyle: "medium" });
+  return h("time", { datetime: text }, shown);
 }
 
-export function download(name, text, type = "application/json") {
-  const url = URL.createObjectURL(new Blob([text], { type }));
+export function download(name, text) {
+  const url = URL.createObjectURL(new Blob([text], { type: "application/json" }));
   h("a", { href: url, download: name }).click();
   setTimeout(() => URL.revokeObjectURL(url), 10000);
 }

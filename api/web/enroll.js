@@ -1,4 +1,4 @@
-import { confirmed, facts, h, plural } from "./dom.js";
+import { confirmed, facts, h } from "./dom.js";
 import { photoForm } from "./form.js";
 import { call, form, session, subjectPath } from "./service.js";
 
@@ -10,26 +10,9 @@ const STEPS = [
   "Only that set is stored, encrypted. Photos and embedding are forgotten.",
 ];
 
-// Why a template of so few photos should not replace the one that there is, or null.
-const fewer = (count, person) =>
-  count > 0 && person?.enrolled_by === "photos" && person.photos > count
-    ? `${plural(count, "photo", "photos")} would replace ${person.photos}: the login becomes less reliable.`
-    : null;
-
-function progress(count, person) {
-  const lack = ENOUGH - count;
-  const dots = Array.from({ length: ENOUGH }, (_, index) => h("span", { class: index < count ? "dot full" : "dot" }));
-  const words =
-    count === 0
-      ? "Three photos make a reliable login."
-      : lack > 0
-        ? `${lack} more for a reliable login.`
-        : "✓ Enough for a reliable login.";
-  const warning = fewer(count, person);
-  return [
-    h("p", {}, h("span", { class: "dots", "aria-hidden": "true" }, dots), words),
-    warning ? h("p", { class: "warning" }, warning) : "",
-  ];
+function progress(count) {
+  if (count === 0) return "Three photos make a reliable login.";
+  return count < ENOUGH ? `${ENOUGH - count} more for a reliable login.` : "✓ Enough for a reliable login.";
 }
 
 export function enrollView(id) {
@@ -52,10 +35,9 @@ export function enrollView(id) {
     } catch (error) {
       const known = error.code === "enrollment_conflict" && error.details.template_id;
       if (!known) throw error;
-      const person = await call("GET", subjectPath(name), { signal: ended.signal }).catch(() => null);
       const agreed = await confirmed(
         `Replace ${name}’s enrollment?`,
-        `Enrolling again replaces the template and its lock. ${fewer(photos.length, person) ?? ""}`,
+        "Enrolling again replaces the template and its lock. Fewer photos make the login less reliable.",
         "Replace",
         ended.signal,
       );

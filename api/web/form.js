@@ -9,7 +9,7 @@ import { problemBox } from "./words.js";
 
 // What differs between the views: `action`, `title` and `lead`; `most` photos, and whether new ones replace them and the
 // camera's are sent at once (`replaces`); `beside` the id; `level()`; `movements`, and whether they are asked for
-// (`moving()`); `verb` on the button; `progress(count, person)`, words below it; `empty`, shown until there is an outcome.
+// (`moving()`); `verb` on the button; `progress(count)`, words below it; `empty`, shown until there is an outcome.
 // `send(name, given, tools)` resolves to an answer, or to null where the visitor gave up; `show(name, answer, tools)` makes
 // the outcome of it, which is about this person and these photos, and with `always` is shown whatever else was chosen
 // meanwhile; `remedies(error, name, tools)` go with a problem.
@@ -18,7 +18,7 @@ export function photoForm(id, view) {
   const why = whyOff(action);
   const on = why === null;
   const ended = new AbortController();
-  const subject = subjectField(id, action, () => rest(), ended.signal);
+  const subject = subjectField(id, action, (person) => holder.known(person), ended.signal);
   const problem = h("div", {});
   const result = h("div", { class: "result", role: "status" });
   const progress = h("div", { class: "progress", role: "status" });
@@ -42,7 +42,7 @@ export function photoForm(id, view) {
   let shooting = false;
   const picker = on ? photoPicker({ most: view.most, replaces, shutter: !replaces, onchange: changed, onsource: () => rest() }) : null;
   const mode = on ? session.mode?.offer(action, refresh) : null;
-  const holder = holderKey(action, subject.input, clear);
+  const holder = holderKey(action, clear);
   // The camera whose photos are sent as soon as they are taken.
   const shutter = () => (replaces && !moving() ? (picker?.live() ?? null) : null);
 
@@ -70,9 +70,9 @@ export function photoForm(id, view) {
     send.disabled = !(camera || moving() || picker?.ready());
     send.formNoValidate = starts;
     if (!picker || !view.progress) return;
-    const words = h("div", {}, view.progress(picker.chosen().length, subject.person()));
+    const words = view.progress(picker.chosen().length);
     // Only what changed is read out.
-    if (words.textContent !== progress.textContent) progress.replaceChildren(...words.childNodes);
+    if (words !== progress.textContent) progress.textContent = words;
   }
 
   async function submit(event) {
@@ -110,6 +110,7 @@ export function photoForm(id, view) {
     let answer = null;
     let failure = null;
     try {
+      await subject.settled();
       const holder_key = await holder.key(name, say);
       if (moving()) given = await view.movements.frames(name);
       answer = await view.send(name, { ...given, holder_key }, tools);
@@ -118,16 +119,15 @@ export function photoForm(id, view) {
     }
     fields.disabled = false;
     if (!view.always && asking !== asked) return;
-    const left = () => (lifts && root.isConnected ? [lifts.whatLeft()] : []);
     if (failure) {
       if (failure.details && !moving()) picker.blame(failure, sent);
-      problem.replaceChildren(problemBox(failure), ...view.remedies(failure, name, tools), ...left());
+      problem.replaceChildren(problemBox(failure), ...view.remedies(failure, name, tools));
       problem.scrollIntoView({ block: "nearest" });
     } else if (answer) {
       const outcome = view.show(name, answer, tools);
       // The field says who is enrolled by now.
       if (action === "enroll") subject.input.dispatchEvent(new Event("input"));
-      result.replaceChildren(outcome, ...left());
+      result.replaceChildren(outcome);
       if (outcome.hasAttribute("tabindex")) outcome.focus();
       result.scrollIntoView({ block: "nearest" });
     }

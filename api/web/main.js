@@ -77,32 +77,15 @@ function signOut(problem) {
 }
 
 // Go on with the key that this tab has kept.
-async function resume(focus) {
+async function resume() {
   try {
     await learn();
-    signedIn(focus);
+    signedIn(false);
   } catch (error) {
+    // The key is kept where the service does not say whether it is good: a reload tries again.
     if (error.status === 401) signOut(error);
-    else if (hasKey()) show(waitingView(error), "Not signed in", focus);
+    else show(signInView(error), "Sign in", false);
   }
-}
-
-// The key is kept, and the service does not say whether it is good.
-function waitingView(problem) {
-  const retry = () => {
-    again.disabled = true;
-    resume(true);
-  };
-  const again = h("button", { type: "button", onclick: retry }, "Try again");
-  const root = h(
-    "section",
-    {},
-    h("h1", { tabindex: "-1" }, "Not signed in yet"),
-    h("p", { class: "lead" }, "This tab has kept your API key."),
-    problemBox(problem),
-    h("p", { class: "row" }, again, h("button", { type: "button", class: "secondary", onclick: () => signOut(null) }, "Sign out")),
-  );
-  return { root };
 }
 
 function signInView(problem = null) {
@@ -184,5 +167,5 @@ for (const type of ["dragover", "drop"]) {
   addEventListener(type, (event) => carriesFiles(event) && event.preventDefault());
 }
 
-if (hasKey()) await resume(false);
+if (hasKey()) await resume();
 else show(signInView(), "Sign in", false);

@@ -1,26 +1,17 @@
 import { command, confirmed, download, facts, field, h, plural, when } from "./dom.js";
 import { call, may, subjectPath } from "./service.js";
-import { about, enroller, offNote, people } from "./subject.js";
+import { about, offNote, people } from "./subject.js";
 import { lacking, problemBox } from "./words.js";
 
 const PAGE = 100;
 const PAUSE_MS = 200;
-const byId = (one, other) => (one.subject_id < other.subject_id ? -1 : 1);
-const ORDERS = {
-  "by id": byId,
-  "latest first": (one, other) => other.updated_at.localeCompare(one.updated_at) || byId(one, other),
-  "fewest photos first": (one, other) => one.photos - other.photos || byId(one, other),
-};
-
 export function peopleView() {
   const list = h("ul", { class: "people" });
   const status = h("p", { class: "hint", role: "status" });
   const problem = h("div", {});
   const receipts = h("div", { class: "result" });
   const prefix = h("input", { type: "search", autocomplete: "off", autocapitalize: "none", spellcheck: "false" });
-  const order = h("select", { onchange: refill }, Object.keys(ORDERS).map((name) => h("option", {}, name)));
   const more = h("button", { type: "button", class: "secondary", hidden: true, onclick: () => load() }, "Show more");
-  const unknown = h("div", {});
   const none = h(
     "section",
     { class: "empty", hidden: true },
@@ -64,15 +55,13 @@ export function peopleView() {
   }
 
   function refill() {
-    list.replaceChildren(...[...shown].sort(ORDERS[order.value]).map(entry));
+    list.replaceChildren(...shown.map(entry));
     more.hidden = cursor === null;
-    const absent = prefix.value && !shown.length;
-    status.textContent = absent
+    status.textContent = prefix.value && !shown.length
       ? "Nobody’s id begins so."
       : `${plural(shown.length, "person", "people")} shown${cursor ? ", with more to come" : ""}.`;
     none.hidden = shown.length > 0 || prefix.value !== "";
     status.hidden = !none.hidden;
-    unknown.replaceChildren(...(absent ? [enroller(prefix.value)] : []));
   }
 
   function entry(person) {
@@ -136,10 +125,9 @@ export function peopleView() {
     may("erase") ? null : offNote(lacking("erase")),
     receipts,
     problem,
-    why ? null : h("div", { class: "find" }, field("Find by how the id begins", prefix), field("Order", order)),
+    why ? null : field("Find by how the id begins", prefix),
     status,
     none,
-    unknown,
     list,
     more,
   );

@@ -10,12 +10,6 @@ import { DEMO, guidance, problemBox, sentence } from "./words.js";
 const SIDE = 1600;
 const BYTES = 2 * 1024 * 1024;
 
-// Runs one piece of work after the other.
-function inTurn() {
-  let last = Promise.resolve();
-  return (work) => (last = last.then(work, work));
-}
-
 // What the browser cannot decode or draw goes to the service as it is, which says why it will not do.
 async function smaller(blob) {
   let bitmap = null;
@@ -42,9 +36,9 @@ export function photoPicker({ most, replaces = false, shutter = false, onchange,
   const face = () => (largest.checked ? "largest" : "");
   const ended = new AbortController();
   let live = null;
-  // Decoded, photos of a telephone take 50 MB each.
-  const decoding = inTurn();
-  const asking = inTurn();
+  // One after the other: decoded, photos of a telephone take 50 MB each.
+  let last = Promise.resolve();
+  const inTurn = (work) => (last = last.then(work, work));
 
   // A burst, some files or a cartoon: what is chosen at one time.
   function take(together) {
@@ -62,12 +56,11 @@ export function photoPicker({ most, replaces = false, shutter = false, onchange,
   function takeFiles(files) {
     const pictures = [...files].filter((file) => file.type.startsWith("image/"));
     const others = [...files].filter((file) => !pictures.includes(file));
-    if (pictures.length) take(pictures.map((file) => ({ blob: file, name: file.name, seen: null })));
+    if (pictures.length) take(pictures.map((file) => ({ blob: file, name: file.name })));
     if (others.length) status.textContent = `No picture: ${others.map((file) => file.name).join(", ")}.`;
   }
 
-  // `seen` is what the service saw already in this very photo, or null.
-  function add({ blob, name, seen }) {
+  function add({ blob, name }) {
     // What the camera took has its size already.
     const ready = name === "camera" ? blob : null;
     const photo = { blob: ready, name, ...faceBox(), image: h("img", { alt: `Chosen photo, from ${name}` }) };
@@ -90,15 +83,14 @@ export function photoPicker({ most, replaces = false, shutter = false, onchange,
     photos.push(photo);
     tray.append(photo.item);
     changed();
-    decoding(async () => {
+    inTurn(async () => {
       if (!photos.includes(photo)) return;
       photo.blob ??= await smaller(blob);
       if (!photos.includes(photo)) return;
       // What is sent is what is shown: its faces are found in these pixels.
       photo.image.src = URL.createObjectURL(photo.blob);
       if (!ready) onchange();
-      if (seen) tell(photo, seen);
-      else look(photo);
+      look(photo);
     });
   }
 
@@ -119,10 +111,13 @@ export function photoPicker({ most, replaces = false, shutter = false, onchange,
   }
 
   function look(photo) {
-    asking(async () => {
+    inTurn(async () => {
       if (!photo.blob || !photos.includes(photo)) return;
       try {
-        tell(photo, await check(photo.blob, face(), ended.signal));
+        const seen = await check(photo.blob, face(), ended.signal);
+        say(photo, seen.usable ? "Good" : guidance(seen), seen.usable ? "good" : "bad");
+        await photo.image.decode().catch(() => {});
+        photo.mark(seen.box, photo.image.naturalWidth, photo.image.naturalHeight);
       } catch (error) {
         if (error.name === "AbortError") return;
         if (!(error instanceof Problem)) throw error;
@@ -130,12 +125,6 @@ export function photoPicker({ most, replaces = false, shutter = false, onchange,
         else say(photo, sentence(error.message), "bad");
       }
     });
-  }
-
-  async function tell(photo, seen) {
-    say(photo, seen.usable ? "Good" : guidance(seen), seen.usable ? "good" : "bad");
-    await photo.image.decode().catch(() => {});
-    photo.mark(seen.box, photo.image.naturalWidth, photo.image.naturalHeight);
   }
 
   function say(photo, text, state) {
@@ -190,7 +179,7 @@ export function photoPicker({ most, replaces = false, shutter = false, onchange,
             const name = `${who.value}, photo ${index + 1}`;
             const choose = async () => {
               const drawn = await fetch(url);
-              if (drawn.ok) take([{ blob: await drawn.blob(), name, seen: null }]);
+              if (drawn.ok) take([{ blob: await drawn.blob(), name }]);
             };
             const label = `Choose photo ${index + 1} of ${who.value}`;
             return h(
@@ -247,11 +236,7 @@ export function photoPicker({ most, replaces = false, shutter = false, onchange,
     start: () => choose(source.value()),
     ready: () => photos.length > 0 && photos.every((photo) => photo.blob),
     // Let photos be dropped on a form.
-    dropOn(form) {
-      const over = (event) => form.classList.toggle("dropping", event.type === "dragover" && holds(event));
-      for (const type of ["dragover", "dragleave", "drop"]) form.addEventListener(type, over);
-      form.addEventListener("drop", (event) => holds(event) && takeFiles(event.dataTransfer.files));
-    },
+    dropOn: (form) => form.addEventListener("drop", (event) => holds(event) && takeFiles(event.dataTransfer.files)),
     blobs: () => photos.map((photo) => photo.blob),
     chosen: () => [...photos],
     // What the service said of single photos, by their places among those `sent`.

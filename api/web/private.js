@@ -1,7 +1,7 @@
 // Private mode: this page finds, aligns and embeds the face, and sends a lifted template alone. It is
 // fetched only where the service serves its pack.
 
-import { folded, h, newId, table } from "./dom.js";
+import { h, newId } from "./dom.js";
 import { BASE, Problem, call, may, session, untilSignedOut } from "./service.js";
 import { lacking } from "./words.js";
 
@@ -29,15 +29,13 @@ let prepared = null;
 // Two lifts of one embedding give it away: lifts by action and photos, and what each photo was lifted for.
 let lifts = new Map();
 let purposes = new Map();
-// What left the browser since that was last told: how often and how many bytes, by request and field.
-let left = new Map();
 
 // At sign-out: the next one to sign in begins anew.
 export function forget() {
   on = true;
   document.documentElement.dataset.lifting = "no";
   prepared = null;
-  [lifts, purposes, left] = [new Map(), new Map(), new Map()];
+  [lifts, purposes] = [new Map(), new Map()];
 }
 
 // Why private mode cannot serve this, or null.
@@ -81,7 +79,6 @@ export function offer(action, onchange) {
 
   function at(level, picker) {
     const before = active();
-    offered.level = level;
     offered.why = whyNot(action, level);
     dropped = "";
     if (before && !active() && picker) {
@@ -136,14 +133,10 @@ async function load(signal, action) {
   });
   // More need a page that is isolated.
   runtime.env.wasm.numThreads = 1;
-  const noted = (url, options) => {
-    note(options.method, url, options.body);
-    return fetch(url, options);
-  };
   for (let tries = 1; ; tries++) {
     signal.throwIfAborted();
     const bearer = await token({ subject_id: NOBODY, action }, signal);
-    const client = new session.client.PrivateClient(BASE, bearer, { runtime, fetch: noted, signal });
+    const client = new session.client.PrivateClient(BASE, bearer, { runtime, signal });
     try {
       await client.prepare();
       signal.addEventListener("abort", () => void client.close());
@@ -206,12 +199,7 @@ async function lifted(client, action, photos, face, until) {
     const given = { face: face || undefined };
     const lift = action === "enroll" ? client.liftEnrollment(photos, given) : client.lift(photos, given);
     lifts.set(all, lift);
-    lift.catch(() => {
-      if (until.aborted || lifts.get(all) !== lift) return;
-      lifts.delete(all);
-      const rest = new Set([...lifts.keys()].flatMap((key) => JSON.parse(key)));
-      for (const name of names) if (!rest.has(name)) purposes.delete(name);
-    });
+    lift.catch(() => lifts.get(all) === lift && lifts.delete(all));
   }
   const lift = await lifts.get(all);
   until.throwIfAborted();
@@ -222,34 +210,19 @@ async function attempt({ photos, face, ...asked }, send) {
   const until = untilSignedOut();
   dropFailed();
   try {
-    for (let first = true; ; first = false) {
-      const client = await ready();
-      until.throwIfAborted();
-      const lift = await lifted(client, asked.action, photos, face, until);
-      const one = client.as(await token(asked, until));
-      try {
-        return await send(one, lift);
-      } catch (error) {
-        if (error.code !== "contract_mismatch" || !first || !(await contractChanged(client, lift, until))) throw error;
-      } finally {
-        await one.close();
-      }
+    const client = await ready();
+    until.throwIfAborted();
+    const lift = await lifted(client, asked.action, photos, face, until);
+    const one = client.as(await token(asked, until));
+    try {
+      return await send(one, lift);
+    } finally {
+      await one.close();
     }
   } catch (error) {
     until.throwIfAborted();
     throw problemOf(error, photos.length);
   }
-}
-
-// Else it is the person's template that is of another contract.
-async function contractChanged(client, lift, signal) {
-  session.contract = await call("GET", "/v1/contract", { signal });
-  if (session.contract.contract_id === lift.contractId) return false;
-  lifts.clear();
-  prepared = null;
-  await client.close();
-  current.at(current.level);
-  return true;
 }
 
 const holder = (key) =>
@@ -265,58 +238,3 @@ export const enroll = (name, { photos, face, holder_key }, replaces) =>
   attempt({ subject_id: name, action: "enroll", photos, face }, async (client, lift) => {
     return await client.enroll(name, lift, { replace: replaces ?? false, ...holder(holder_key) });
   });
-
-// Count every call of the page, in private mode or not.
-export function note(method, target, body) {
-  const { searchParams, href } = new URL(target);
-  const path = href.slice(BASE.length).replace(/\?.*/, "");
-  const request = `${method} ${path.replace(/([0-9a-f]{8})[0-9a-f]{56}/, "$1…")}`;
-  const sent = typeof body === "string" ? Object.entries(JSON.parse(body)) : [...(body ?? [])];
-  const fields = [...searchParams, ...sent];
-  for (const [field, value] of fields.length ? fields : [["no body", ""]]) {
-    const name = JSON.stringify([request, field]);
-    const row = left.get(name) ?? { request, field, times: 0, size: 0, photo: false };
-    left.set(name, row);
-    row.times += 1;
-    row.size += size(value);
-    row.photo ||= value instanceof Blob;
-  }
-}
-
-const size = (value) =>
-  value instanceof Blob
-    ? value.size
-    : new TextEncoder().encode(typeof value === "string" ? value : JSON.stringify(value)).length;
-
-// Every field of every request since this was last told.
-export function whatLeft() {
-  const rows = [...left.values()];
-  left = new Map();
-  const photos = rows.some(({ photo }) => photo)
-    ? "Photos were sent while private mode was off. "
-    : "No photo and no embedding was sent. ";
-  return h(
-    "section",
-    { class: "card", "data-left": "" },
-    h("h2", {}, "What left this browser"),
-    h("p", {}, photos),
-    folded(
-      "Every field that was sent",
-      h(
-        "p",
-        { class: "hint" },
-        "These are the calls since you signed in, or since this was last shown. ",
-        "Beside these fields, they had their headers, with the API key or a token.",
-      ),
-      table(
-        "Fields that were sent",
-        ["Request", "Field", "Size"],
-        rows.map(({ request, field, times, size, photo }) => [
-          h("code", {}, request),
-          [field, photo ? ", a photo" : "", times > 1 ? `, ${times} times` : ""].join(""),
-          `${size.toLocaleString("en")} bytes`,
-        ]),
-      ),
-    ),
-  );
-}

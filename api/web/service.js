@@ -61,7 +61,6 @@ export async function call(method, path, { json, body, headers, signal } = {}) {
   const used = key;
   const ended = AbortSignal.any([running.signal, ...(signal ? [signal] : [])]);
   let answer;
-  session.mode?.note(method, BASE + path, body);
   try {
     answer = await fetch(BASE + path, {
       method,

@@ -1,6 +1,5 @@
-import { download, facts, field, folded, h, oneIn, percent, plural, table, when } from "./dom.js";
-import { call, may, session, subjectPath } from "./service.js";
-import { people } from "./subject.js";
+import { download, facts, folded, h, oneIn, percent, table, when } from "./dom.js";
+import { call, session } from "./service.js";
 import { problemBox } from "./words.js";
 
 const RIGHTS = {
@@ -40,17 +39,10 @@ export function serviceView() {
 }
 
 function health() {
-  const strip = h("div", { class: "health", role: "status" });
-  const again = h("button", { type: "button", class: "quiet", onclick: ask }, "Check again");
-  async function ask() {
-    strip.replaceChildren(h("span", {}, "Checking…"));
-    const ready = await call("GET", "/health/ready").then(
-      () => h("span", { class: "up" }, "Database and model are up"),
-      problemBox,
-    );
-    strip.replaceChildren(ready, again);
-  }
-  ask();
+  const strip = h("div", { class: "health", role: "status" }, "Checking…");
+  call("GET", "/health/ready")
+    .then(() => h("span", { class: "up" }, "Database and model are up"), problemBox)
+    .then((answer) => strip.replaceChildren(answer));
   return strip;
 }
 
@@ -105,39 +97,13 @@ function tile(title, judgement) {
   );
 }
 
-// What the service keeps of a person, by the example of one who is enrolled.
+// What the service keeps of a person, and by which contract.
 function storedCard({ binding, contract_id: id, recorded, default_level: level, receipt_key: receipt }) {
-  const example = h("div", {});
-  if (may("enroll")) {
-    people("", { limit: 100 }).then(({ subjects }) => show(subjects), () => {});
-  }
-  function show(subjects) {
-    if (!subjects.length) return;
-    const select = h("select", { onchange: describe }, subjects.map((person) => h("option", {}, person.subject_id)));
-    const place = h("div", {});
-    async function describe() {
-      const name = select.value;
-      const person = await call("GET", subjectPath(name)).catch(() => null);
-      if (!person || select.value !== name) return;
-      place.replaceChildren(
-        facts([
-          ["Id", name],
-          ["Template", ["encrypted, ", h("code", {}, `${person.template_id.slice(0, 12)}…`)]],
-          ["Made of", person.photos ? `${plural(person.photos, "photo", "photos")}, not kept` : "a template that a client lifted"],
-          ["Enrolled", when(person.updated_at)],
-          ["Holder key", person.holder_key ? "needed, and not kept" : null],
-        ]),
-      );
-    }
-    example.replaceChildren(field("Person", select), place);
-    describe();
-  }
   return h(
     "section",
     { class: "card" },
     h("h2", {}, "What is stored"),
     h("p", {}, "Of each person an id, dates, and one encrypted template: a set that holds the embedding among decoys. No photo, and no embedding as such. How well the set hides it is the verdict above."),
-    example,
     folded(
       "Geometry and contract",
       facts([

@@ -41,8 +41,8 @@ export const switchOf = (mode) =>
   mode?.root ??
   offNote(LIFTS && !session.mode && "Private mode could not be loaded: photos are sent to the service. Reload the page.");
 
-// `input`, its `part` of the form, `id()` in the form in which the service keeps it, and `person()`, who is known to be
-// enrolled under it, or null; `onperson` is called where that changes. Searches end with `until`.
+// `input`, its `part` of the form, `id()` in the form in which the service keeps it, and `settled()`, which waits for the
+// search that goes on. `onperson` is called with the person who is enrolled under the id, or null. Searches end with `until`.
 export function subjectField(id, action, onperson, until) {
   const searches = may("enroll");
   const list = h("datalist", { id: newId("people") });
@@ -58,53 +58,58 @@ export function subjectField(id, action, onperson, until) {
     value: id,
   });
   const part = field("Person’s id", input);
-  let known = null;
-  const person = () => known;
   // However it was typed, a passkey of it is the same.
   const typedId = () => input.value.normalize("NFC");
-  if (!searches) return { input, part, id: typedId, person };
+  if (!searches) return { input, part, id: typedId, settled: async () => {} };
   let running = new AbortController();
   let timer = 0;
+  let searching = null;
 
   async function search() {
+    timer = 0;
     const { signal } = running;
     const typed = typedId();
     // It is an aid: what is wrong, the form says when it is sent.
     const page = await people(typed, { limit: SHOWN, signal }).catch(() => null);
     if (signal.aborted) return;
-    status.replaceChildren(...(page ? words(page, typed) : []));
+    const exact = page?.subjects.find((each) => each.subject_id === typed);
+    status.replaceChildren(...(page ? words(page, typed, exact) : []));
     list.replaceChildren(
       ...(page?.subjects ?? []).map((each) =>
         h("option", { value: each.subject_id }, h("span", {}, about(each)).textContent),
       ),
     );
-    known = page?.subjects.find((each) => each.subject_id === typed) ?? null;
-    onperson();
+    if (page) onperson(exact ?? null);
   }
 
-  function words({ subjects, next_cursor: more }, typed) {
-    const exact = subjects.find((each) => each.subject_id === typed);
+  function words({ subjects, next_cursor: more }, typed, exact) {
     if (exact) return ["✓ Enrolled: ", ...about(exact)];
     if (action === "enroll" && typed) return ["New person."];
     if (!subjects.length) return [typed ? "Nobody is enrolled under this id." : "Nobody is enrolled yet."];
     return [`${more ? "More than " : ""}${plural(subjects.length, "person", "people")} ${typed ? "found" : "enrolled"}.`];
   }
 
-  input.addEventListener("input", () => {
+  function stop() {
     clearTimeout(timer);
     running.abort();
     running = new AbortController();
+  }
+
+  input.addEventListener("input", () => {
+    stop();
     status.replaceChildren();
-    known = null;
-    onperson();
-    timer = setTimeout(search, PAUSE_MS);
+    timer = setTimeout(() => (searching = search()), PAUSE_MS);
   });
   input.addEventListener("focus", () => input.value || list.childElementCount || search());
-  until.addEventListener("abort", () => {
-    clearTimeout(timer);
-    running.abort();
-  });
+  until.addEventListener("abort", stop);
   part.append(list, status);
-  if (id) search();
-  return { input, part, id: typedId, person };
+  if (id) searching = search();
+  async function settled() {
+    if (timer) {
+      clearTimeout(timer);
+      searching = search();
+    }
+    await searching;
+  }
+  return { input, part, id: typedId, settled };
 }

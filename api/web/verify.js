@@ -1,5 +1,5 @@
 import { headMovements } from "./challenge.js";
-import { field, folded, h, oneIn, percent, s } from "./dom.js";
+import { field, folded, h, oneIn, percent } from "./dom.js";
 import { photoForm } from "./form.js";
 import { call, form, levels, may, moves, session, subjectPath } from "./service.js";
 import { enroller } from "./subject.js";
@@ -90,30 +90,14 @@ function decision(id, answer, kind) {
     { class: `verdict ${accepted ? "accept" : "reject"}` },
     h("p", { class: "verdict-word" }, accepted ? "✓ Accepted" : "✕ Rejected"),
     h("p", {}, REASONS[answer.reason] ?? NOT_LIVE[kind], answer.advice ? ` ${answer.advice}` : ""),
-    answer.distance === undefined ? null : gauge(answer.distance, answer.distance_threshold),
+    answer.distance === undefined
+      ? null
+      : h("p", {}, "Distance ", h("strong", {}, answer.distance.toFixed(3)), `, accepted up to ${answer.distance_threshold.toFixed(3)}.`),
     h("p", {}, h("strong", {}, id), `, at level ${answer.level}: strangers are accepted at ${percent(answer.fmr)} (${oneIn(answer.fmr)}).`),
     live ? h("p", {}, `Liveness: ${live}.`) : null,
     folded(
       "For support",
       h("p", { class: "fine" }, "Reason ", h("code", {}, answer.reason), ", request ", h("code", {}, answer.request_id)),
-    ),
-  );
-}
-
-// The distance on a line that ends at twice the threshold.
-function gauge(distance, threshold) {
-  const at = Math.min(98, 50 * (distance / threshold || 0));
-  return h(
-    "figure",
-    { class: "gauge" },
-    h("figcaption", {}, "Distance ", h("strong", {}, distance.toFixed(3)), `, accepted up to ${threshold.toFixed(3)}`),
-    s(
-      "svg",
-      { viewBox: "0 0 100 8", preserveAspectRatio: "none", "aria-hidden": "true" },
-      s("rect", { class: "gauge-line", x: 0, y: 3, width: 100, height: 2 }),
-      s("rect", { class: "gauge-within", x: 0, y: 3, width: 50, height: 2 }),
-      s("rect", { class: "gauge-limit", x: 49.8, y: 0, width: 0.4, height: 8 }),
-      s("rect", { class: "gauge-here", x: at, y: 0, width: 2, height: 8 }),
     ),
   );
 }

@@ -8,7 +8,7 @@ const REMEDIES = {
   unauthorized: "Check the API key: it may be mistyped, revoked or expired.",
   not_enrolled: "Check the id, or enroll the person first.",
   not_found: "The service has nothing at this address. It may have been updated: reload the page.",
-  contract_mismatch: "This person was enrolled under an earlier contract. Enroll them again.",
+  contract_mismatch: "This person was enrolled under an earlier contract. Enroll them again; if that does not help, reload the page.",
   unsupported_image: "Send a JPEG, PNG or WebP photo.",
   image_too_large: "Send a smaller photo.",
   request_too_large: "Send fewer or smaller photos.",
@@ -27,13 +27,12 @@ const REMEDIES = {
   model_unavailable: "Try again in a moment. If it keeps happening, tell the operator.",
   enrollment_conflict: "This person was enrolled or erased meanwhile. Look them up, and enroll them again if need be.",
   passkey_refused: "Try again, on the device that has the passkey. If it is lost, enroll the person again.",
-  passkey_unsupported: "Use another device or browser, or a key file. If a passkey was made just now, delete it.",
+  passkey_unsupported: "Use another device or browser. If a passkey was made just now, delete it.",
   passkey_of_another: "Choose the passkey that is named after the id. If it is lost, enroll the person again.",
   replayed: "Start again: it came too late, or twice.",
   private_mode: "Reload the page, or switch private mode off: photos then go to the service.",
   lifted_before: "Choose another photo.",
   camera: "See that no other program uses the camera, and try again.",
-  key_file: "Choose the file that was made for this person. If it is lost, enroll the person again.",
   internal_error: "Report the request id to the operator.",
   unreachable: "Check your connection and that the service is running, then try again.",
 };
@@ -65,21 +64,11 @@ export const MOVEMENTS = {
   come_closer: ["Come closer", "⤢"],
 };
 
-const FAILURES = {
-  not_frontal: "the first frame did not look straight ahead",
-  jump: "the head jumped between two frames",
-  no_turn: "the head did not turn, as a photo does not",
-  missing_movement: "a movement was not seen",
-  wrong_order: "the movements came in another order, or there was one too many",
-  another_person: "the frames do not show one person",
-  passive: "the photos look like a picture of a picture",
-};
-
 // For a list of facts; why it failed is told to some keys only.
 export function livenessWords({ liveness, liveness_failure: why }) {
   if (liveness === "not_checked") return null;
   if (liveness === "passed") return "passed, as a good print, a screen or a recording may";
-  return why ? `failed: ${FAILURES[why] ?? why}` : liveness;
+  return why ? `failed (${why.replaceAll("_", " ")})` : liveness;
 }
 
 export function cameraTrouble(error) {
@@ -92,7 +81,6 @@ export function cameraTrouble(error) {
 // The service writes for programs, the page for people.
 const TITLES = {
   unauthorized: "The service does not accept this API key.",
-  // The service says for how long; the page counts that down, and one clock is enough.
   locked_out: "Too many failed attempts for this person.",
 };
 
@@ -133,22 +121,6 @@ const capital = (text) => text.charAt(0).toUpperCase() + text.slice(1);
 
 export const sentence = (text) => capital(text) + (/[.!?]$/.test(text) ? "" : ".");
 
-function waiting(seconds) {
-  const shown = h("strong", {}, duration(seconds));
-  const until = Date.now() + 1000 * seconds;
-  const timer = setInterval(() => {
-    const left = Math.ceil((until - Date.now()) / 1000);
-    if (left > 0 && shown.isConnected) shown.textContent = duration(left);
-    else {
-      if (left <= 0) line.textContent = "You can try again now.";
-      clearInterval(timer);
-    }
-  }, 1000);
-  // Not read out every second: the alert told the time once.
-  const line = h("p", { "aria-live": "off" }, "Try again in ", shown, ".");
-  return line;
-}
-
 function duration(seconds) {
   if (seconds < 120) return `${seconds} s`;
   if (seconds < 7200) return `${Math.round(seconds / 60)} minutes`;
@@ -175,7 +147,7 @@ export function problemBox(problem) {
               ? "This person is locked out until an operator lifts the lock."
               : remedy(problem),
           ),
-    problem.wait && !disabled ? waiting(problem.wait) : null,
+    problem.wait && !disabled ? h("p", {}, `Try again in ${duration(problem.wait)}.`) : null,
     h(
       "p",
       { class: "fine" },

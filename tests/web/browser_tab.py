@@ -113,12 +113,12 @@ class BrowserTab:
         self.press(f"Choose photo {shot} of {person}")
         self.good(None)
 
-    def lock_by(self, lock: str) -> None:
-        """Choose the holder key, among the options."""
+    def lock(self, on: bool = True) -> None:
+        """Switch the passkey on or off, among the options."""
         details = self.page.locator("details").first
         if not details.evaluate("(each) => each.open"):
             details.locator("summary").click()
-        self.page.get_by_role("radio", name=lock, exact=True).check()
+        details.get_by_role("checkbox").first.set_checked(on)
 
     def good(self, count: int | None) -> None:
         """Wait until this many chosen photos will do, or the last one."""

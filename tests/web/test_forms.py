@@ -13,7 +13,7 @@ from tests.api.cli.conftest import run
 from tests.web.answers import DECISION, PendingRequests, refused
 from tests.web.conftest import OpenTab
 from tests.web.served import Served
-from tests.web.walk import TO_FILE, enroll
+from tests.web.walk import enroll
 
 pytestmark = pytest.mark.long
 
@@ -29,12 +29,11 @@ async ([selector, url]) => {
   const target = document.querySelector(selector);
   const options = { bubbles: true, cancelable: true, dataTransfer: data };
   const over = !target.dispatchEvent(new DragEvent("dragover", options));
-  const lit = document.querySelector("form.dropping") !== null;
-  return [over, lit, !target.dispatchEvent(new DragEvent("drop", options))];
+  return [over, !target.dispatchEvent(new DragEvent("drop", options))];
 }
 """
 """Drop a picture, a key file or text on an element; whether the page takes it over from the browser
-while it is above, lights up its form, and takes it over when it is dropped."""
+while it is above, and when it is dropped."""
 
 
 @pytest.fixture
@@ -58,10 +57,6 @@ def test_people_whose_ids_begin_so_are_suggested(open_tab: OpenTab, demo: Served
     expect(suggested).to_have_count(3)
     expect(suggested.last).to_have_text(re.compile("^1 photo, "))
     expect(page.get_by_text("3 people found.")).to_be_visible()
-    tab.open("Service")
-    page.get_by_label("Person", exact=True).select_option(NAMES[0])
-    expect(page.get_by_text("1 photo, not kept")).to_be_visible()
-    tab.open("Verify")
     # One that is enrolled is enough said, though another id begins with it.
     field.fill("found-ben")
     expect(page.get_by_text("✓ Enrolled: 1 photo")).to_be_visible()
@@ -212,33 +207,6 @@ def test_a_lock_that_cannot_be_lifted_is_said_once(open_tab: OpenTab, demo: Serv
     expect(page.get_by_role("alert")).to_have_count(2)
 
 
-def test_what_is_known_of_a_person_goes_with_the_id(open_tab: OpenTab, demo: Served) -> None:
-    enroll(demo, "three", "person-2", shots=3)
-    tab = open_tab(demo)
-    page = tab.page
-    tab.open("Enroll")
-    tab.choose_drawn("person-1", 1)
-    tab.name_person("three")
-    warning = page.get_by_text("1 photo would replace 3")
-    expect(warning).to_be_visible()
-    searches = PendingRequests(page, "**/v1/subjects?*")
-    tab.name_person("another")
-    expect(warning).to_have_count(0)
-    # A search that ends meanwhile leaves the button as it is.
-    search = searches.wait()
-    enrollment = PendingRequests(page, "**/enrollment")
-    tab.press("Enroll")
-    waiting = enrollment.wait()
-    search.continue_()
-    expect(page.get_by_text("New person.")).to_be_visible()
-    expect(page.locator("button[type=submit]")).to_have_text("Enrolling…")
-    expect(page.locator(".act-part .unseen[role=status]")).to_have_text("Enrolling…")
-    waiting.fulfill(**refused(429, "overloaded", "x"))
-    expect(page.locator("button[type=submit]")).to_have_text("Enroll")
-    with demo.client() as client:
-        assert client.delete("/v1/subjects/three").is_success
-
-
 def test_a_receipt_is_good_for_the_contract_beside_it(
     open_tab: OpenTab, demo: Served, tmp_path: Path
 ) -> None:
@@ -268,23 +236,20 @@ def test_photos_are_dropped_on_the_form(open_tab: OpenTab, demo: Served) -> None
     tab.open("Enroll")
     url = "/demo/people/person-1/0.png"
     for count in (1, 2):
-        assert page.evaluate(DROP, ["form", url]) == [True, True, True]
+        assert page.evaluate(DROP, ["form", url]) == [True, True]
         tab.good(count)
-    expect(page.locator("form.dropping")).to_have_count(0)
     # What misses the form is taken by nobody, and does not replace the page.
-    assert page.evaluate(DROP, ["h1", url]) == [True, False, True]
-    assert page.evaluate(DROP, ["h1", "text"]) == [False, False, False]
-    # What is no picture is not sent anywhere; the place for the key file takes it.
-    assert page.evaluate(DROP, ["form", "key file"]) == [True, True, True]
+    assert page.evaluate(DROP, ["h1", url]) == [True, True]
+    assert page.evaluate(DROP, ["h1", "text"]) == [False, False]
+    # What is no picture is not sent anywhere.
+    assert page.evaluate(DROP, ["form", "key file"]) == [True, True]
     expect(page.get_by_text("No picture: key.txt.")).to_be_visible()
-    tab.lock_by(TO_FILE)
-    assert page.evaluate(DROP, ["details .drop", "key file"]) == [True, False, True]
-    expect(page.locator("details .drop")).to_contain_text("key.txt")
     expect(page.locator(".tray li")).to_have_count(2)
     # Where the form is switched off, it takes nothing.
     tab.sign_in(demo.key("verify"))
     tab.open("Enroll")
-    assert page.evaluate(DROP, ["form", url])[1] is False
+    page.evaluate(DROP, ["form", url])
+    expect(page.locator(".tray li")).to_have_count(0)
 
 
 def test_a_late_decision_names_whom_it_is_about(open_tab: OpenTab, demo: Served) -> None:

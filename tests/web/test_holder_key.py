@@ -1,4 +1,4 @@
-"""Enrollments that are locked to a key of their holder's: from a passkey, or from a file."""
+"""Enrollments that are locked to a key of their holder's, from a passkey."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -8,12 +8,10 @@ import pytest
 from playwright.sync_api import expect
 
 from tests.clients.javascript.conftest import require_client
-from tests.web.access import assert_accessible
 from tests.web.browser_tab import BrowserTab
 from tests.web.conftest import OpenTab
 from tests.web.passkeys import Authenticator
 from tests.web.served import Served
-from tests.web.walk import TO_FILE, TO_PASSKEY
 
 pytestmark = pytest.mark.long
 
@@ -36,22 +34,20 @@ class Visitor:
     authenticator: Authenticator
     console: list[str]
 
-    def enroll(self, lock: str) -> None:
-        """Enroll the drawn person, locked in this way."""
+    def enroll(self) -> None:
+        """Enroll the drawn person, locked to a passkey."""
         self.tab.open("Enroll")
         self.tab.name_person(SUBJECT)
         for shot in (1, 2, 3):
             self.tab.choose_drawn(PERSON, shot)
-        self.tab.lock_by(lock)
+        self.tab.lock()
         self.tab.press("Enroll")
 
-    def verify(self, lock: str | None = None, subject: str = SUBJECT) -> None:
-        """Show another photo of the same person; choose the lock, or let the page do it."""
+    def verify(self, subject: str = SUBJECT) -> None:
+        """Show another photo of the same person; the page knows of the lock."""
         self.tab.open("Verify")
         self.tab.name_person(subject)
         self.tab.choose_drawn(PERSON, 4)
-        if lock:
-            self.tab.lock_by(lock)
         self.tab.press("Verify")
 
     def sent(self, path: str) -> int:
@@ -79,17 +75,17 @@ def test_a_face_is_accepted_with_the_passkey_that_it_was_enrolled_with(
 ) -> None:
     visitor = visit()
     tab, page = visitor.tab, visitor.tab.page
-    visitor.enroll(TO_PASSKEY)
+    visitor.enroll()
     expect(page.locator(".verdict")).to_contain_text("Holder keyneeded at every verification")
     page.get_by_role("link", name="Verify this person").click()
-    expect(page.get_by_role("radio", name="Passkey", exact=True)).to_be_checked()
+    expect(page.get_by_label("Use the passkey")).to_be_checked()
     expect(page.get_by_text("This enrollment is locked to a holder key.")).to_be_visible()
     tab.choose_drawn(PERSON, 4)
     tab.press("Verify")
     tab.is_decided("accept")
 
     # Without the key, the face is not enough.
-    tab.lock_by("None")
+    tab.lock(False)
     expect(page.locator(".verdict")).to_have_count(0)
     tab.press("Verify")
     tab.is_decided("reject")
@@ -133,7 +129,7 @@ def assert_kept_nowhere(visitor: Visitor, key: str, log: Path) -> None:
 def test_another_authenticator_opens_nothing(visit: Visit) -> None:
     visitor = visit()
     tab, page = visitor.tab, visitor.tab.page
-    visitor.enroll(TO_PASSKEY)
+    visitor.enroll()
     tab.is_decided("accept")
     visitor.authenticator.exchange()
     visitor.verify()
@@ -142,7 +138,7 @@ def test_another_authenticator_opens_nothing(visit: Visit) -> None:
 
     # A passkey of the same name: made for an enrollment that did not come about.
     page.route("**/enrollment", lambda route: route.abort())
-    visitor.enroll(TO_PASSKEY)
+    visitor.enroll()
     tab.is_refused("unreachable", "The service does not respond.")
     page.unroute("**/enrollment")
     tab.complaints.remove("Failed to load resource: net::ERR_FAILED")
@@ -154,9 +150,15 @@ def test_another_authenticator_opens_nothing(visit: Visit) -> None:
 
 def test_a_passkey_of_another_id_is_not_sent(visit: Visit) -> None:
     visitor = visit()
-    visitor.enroll(TO_PASSKEY)
+    visitor.enroll()
     visitor.tab.is_decided("accept")
-    visitor.verify("Passkey", subject="person-2")
+    tab = visitor.tab
+    tab.open("Verify")
+    tab.name_person("person-2")
+    expect(tab.page.get_by_text("✓ Enrolled")).to_be_visible()
+    tab.choose_drawn(PERSON, 4)
+    tab.lock()
+    tab.press("Verify")
     visitor.tab.is_refused("passkey_of_another", "This passkey is not for person-2.")
     assert visitor.sent("/verify") == 0
 
@@ -178,11 +180,19 @@ def test_a_passkey_is_of_an_id_however_it_is_spelt(visit: Visit) -> None:
     assert len(set(keys)) == 1
 
 
+def test_an_ip_address_has_no_passkeys(open_tab: OpenTab, demo: Served) -> None:
+    tab = open_tab(demo)
+    tab.open("Enroll")
+    tab.page.get_by_text("Options:").click()
+    expect(tab.page.get_by_label("Lock to a passkey")).to_be_disabled()
+    expect(tab.page.get_by_text("Passkeys belong to a host name")).to_be_visible()
+
+
 def test_what_keeps_a_passkey_from_being_used_is_said(visit: Visit) -> None:
     visitor = visit()
     tab, page = visitor.tab, visitor.tab.page
     visitor.authenticator.exchange(prf=False)
-    visitor.enroll(TO_PASSKEY)
+    visitor.enroll()
     tab.is_refused("passkey_unsupported", "no PRF extension")
     visitor.authenticator.exchange()
     visitor.authenticator.refuse()
@@ -199,62 +209,3 @@ def test_what_keeps_a_passkey_from_being_used_is_said(visit: Visit) -> None:
     tab.press("Enroll")
     tab.is_decided("accept")
     assert visitor.authenticator.passkeys() == 1
-
-
-def test_a_key_file_locks_where_an_ip_address_has_no_passkeys(
-    open_tab: OpenTab, demo: Served, tmp_path: Path
-) -> None:
-    tab = open_tab(demo)
-    page = tab.page
-    console: list[str] = []
-    page.on("console", lambda message: console.append(message.text))
-    tab.open("Enroll")
-    tab.lock_by(TO_FILE)
-    expect(page.get_by_role("radio", name=TO_PASSKEY)).to_be_disabled()
-    expect(page.get_by_text("Passkeys belong to a host name")).to_be_visible()
-    assert_accessible(tab, "enroll-no-passkeys")
-    tab.name_person(SUBJECT)
-    for shot in (1, 2, 3):
-        tab.choose_drawn(PERSON, shot)
-    tab.press("Enroll")
-    # The browser asks for the file.
-    assert not any(url.endswith("/enrollment") for url in tab.requests)
-    own, other = (made_key_file(tab, tmp_path) for _ in range(2))
-    assert own.read_text() != other.read_text()
-    file = page.locator("details input[type=file]")
-    file.set_input_files(own)
-    tab.press("Enroll")
-    tab.is_decided("accept")
-    tab.open("Verify")
-    tab.name_person(SUBJECT)
-    tab.choose_drawn(PERSON, 4)
-    expect(page.get_by_role("radio", name="Key file")).to_be_checked()
-    # What the page chose for one person is not chosen for the next.
-    for name, choice in (("nobody", "None"), (SUBJECT, "Key file")):
-        tab.name_person(name)
-        page.get_by_label("Person’s id").blur()
-        expect(page.get_by_role("radio", name=choice, exact=True)).to_be_checked()
-    for chosen, decision in ((other, "reject"), (own, "accept")):
-        file.set_input_files(chosen)
-        tab.press("Verify")
-        tab.is_decided(decision)
-        # It is dropped with the answer.
-        assert file.evaluate("(input) => input.files.length") == 0
-    nonsense = tmp_path / "nonsense.txt"
-    nonsense.write_text("not a key")
-    file.set_input_files(nonsense)
-    tab.press("Verify")
-    tab.is_refused("key_file", "That is no key file.")
-    assert sum(url.endswith("/verify") for url in tab.requests) == 2
-    visitor = Visitor(tab, Authenticator.of(page), console)
-    assert_kept_nowhere(visitor, own.read_text().strip(), demo.log)
-
-
-def made_key_file(tab: BrowserTab, folder: Path) -> Path:
-    """Let the page make a key file; return where it was saved."""
-    with tab.page.expect_download() as download:
-        tab.press("Make a key file")
-    assert download.value.suggested_filename == f"{SUBJECT}.holder-key.txt"
-    saved = folder / f"{len(list(folder.iterdir()))}.txt"
-    download.value.save_as(saved)
-    return saved
