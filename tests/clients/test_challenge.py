@@ -8,7 +8,7 @@ from tests.api.deployment import deploy
 from tests.clients.conftest import Running, started
 from tests.heads import performed
 from tests.marked_heads import frame, write_marked_pack
-from veilface_client import Client, Forbidden, InvalidRequest, Unauthorized
+from veilface_client import Client, Forbidden, ServiceError, Unauthorized
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +27,7 @@ def test_a_challenge_is_answered_once(asking: Running) -> None:
         assert refused.value.details == {"liveness": "active"}
         challenge = client.challenge("anna")
         frames = [frame(name) for name in performed(challenge.movements)]
-        with pytest.raises(InvalidRequest, match="5 to 12 frames"):
+        with pytest.raises(ServiceError, match="5 to 12 frames"):
             client.verify("anna", frames[:4], challenge=challenge)
         decision = client.verify("anna", frames, challenge=challenge)
         assert decision

@@ -3,7 +3,6 @@
 A scripted service answers: for what real ones do not show. ``test_private.py`` has the real ones.
 """
 
-import asyncio
 import base64
 import dataclasses
 import json
@@ -27,12 +26,10 @@ from templates.keys.rotation import ROTATION_VERSION
 from templates.space.lifting import Strategy
 from tests.api.deployment import make_source, photo, write_pack
 from veilface_client import (
-    AsyncPrivateClient,
     ConnectionFailed,
     ContractMismatch,
     Enrollable,
     LiftFailed,
-    LiftUnavailable,
     PrivateClient,
     Probe,
     Retries,
@@ -94,7 +91,6 @@ class Scripted:
     contracts: Sequence[tuple[results.Contract, results.Generator]]
     changes: int = 0
     stale_generators: int = 0
-    refuse_always: bool = False
     current: int = 0
     lost: int = 0
     overloaded: int = 0
@@ -126,8 +122,6 @@ class Scripted:
             self.changes -= 1
             self.current += 1
             return self.refusal(409, "contract_mismatch")
-        if self.refuse_always:
-            return self.refusal(409, "contract_mismatch")
         if self.overloaded:
             self.overloaded -= 1
             return self.refusal(503, "overloaded")
@@ -156,32 +150,21 @@ def client(pack: Path, service: Scripted) -> Iterator[PrivateClient]:
         yield made
 
 
-def test_a_contract_that_changed_is_fetched_once_more(
+def test_a_contract_that_changed_is_told_and_never_lifted_for_by_itself(
     client: PrivateClient, service: Scripted
 ) -> None:
-    first, second = (contract.contract_id for contract, _ in service.contracts)
-    service.changes = 1
-    assert client.enroll("anna", photo(1)).contract_id == second
-    assert (service.fetched, service.lifts) == (2, 2)
-    service.changes = 1
-    assert client.verify("anna", photo(1)).contract_id == first
-    assert (service.fetched, service.lifts) == (3, 4)
-    service.changes = 2
-    with pytest.raises(ContractMismatch):
-        client.enroll("anna", photo(1))
-    assert service.lifts == 6
-
-
-def test_no_second_lift_where_the_contract_is_the_same(
-    client: PrivateClient, service: Scripted
-) -> None:
-    """The subject's stored template is of another contract: lifting again heals nothing."""
-    service.refuse_always = True
+    """Two lifts of one photo give the embedding away, and the service may only claim a change."""
+    second = service.contracts[1][0].contract_id
     for call in (client.enroll, client.verify):
+        service.changes = 1
         with pytest.raises(ContractMismatch) as failed:
             call("anna", photo(1))
         assert failed.value.lift is None, "repeating it heals nothing"
-    assert len(service.bodies) == service.lifts == 2
+    assert (service.fetched, service.lifts, len(service.bodies)) == (2, 2, 2)
+    service.current = 1
+    assert client.enroll("anna", photo(2)).contract_id == second
+    assert client.verify("anna", photo(3)).contract_id == second
+    assert service.fetched == 3
 
 
 def test_a_resend_repeats_the_template(client: PrivateClient, service: Scripted) -> None:
@@ -217,28 +200,6 @@ def test_after_a_failure_the_lift_is_repeated(client: PrivateClient, service: Sc
     assert (len(service.bodies), service.lifts) == (6, 2)
     assert isinstance(failing(client.verify, Unavailable, overloaded=3), Probe)
     assert (len(service.bodies), service.lifts) == (10, 3)
-
-
-def test_asynchronously(pack: Path, service: Scripted) -> None:
-    service.lost = 2
-
-    async def scenario() -> None:
-        async with AsyncPrivateClient(
-            "http://x",
-            TOKEN,
-            pack=pack,
-            transport=httpx.MockTransport(service),
-            retries=Retries(sendings=1),
-        ) as client:
-            lift = await client.lift_enrollment(photo(1))
-            for _ in range(2):
-                with pytest.raises(ConnectionFailed) as failed:
-                    await client.enroll("anna", lift)
-                assert failed.value.lift is lift
-            assert await client.enroll("anna", lift)
-
-    asyncio.run(scenario())
-    assert (len(service.bodies), service.lifts) == (3, 1)
 
 
 def test_a_lift_is_sent_as_often_as_it_must(client: PrivateClient, service: Scripted) -> None:
@@ -321,10 +282,10 @@ def test_what_does_not_serve_is_said_without_a_lift(pack: Path, tmp_path: Path) 
 
 def test_without_the_library(monkeypatch: pytest.MonkeyPatch, pack: Path) -> None:
     monkeypatch.setitem(sys.modules, "enroll.public_contract", None)
-    with pytest.raises(LiftUnavailable, match="call no package of yours"):
+    with pytest.raises(LiftFailed, match="call no package of yours"):
         Lifter(pack, dim=None).keep(*answers(pack))
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(LiftUnavailable, match=r"veilface-client\[private\]"):
+    with pytest.raises(LiftFailed, match=r"veilface-client\[private\]"):
         PrivateClient("http://service.test", TOKEN, pack=pack)
 
 

@@ -1,6 +1,5 @@
 """The private clients: real lifts, for a service that has no pack."""
 
-import asyncio
 import io
 from pathlib import Path
 
@@ -10,7 +9,6 @@ from tests.api.deployment import photo
 from tests.clients.conftest import Running
 from tests.clients.proxy import Proxy
 from veilface_client import (
-    AsyncPrivateClient,
     ConnectionFailed,
     PrivateClient,
     Retries,
@@ -45,19 +43,13 @@ def test_enrolled_and_verified_without_a_photo_leaving(packless: Running, tmp_pa
     assert sent.count(b"GET /v1/contract/generator") == 1, "fetched once, and kept"
 
 
-def test_asynchronously(packless: Running) -> None:
-    async def scenario() -> None:
-        async with AsyncPrivateClient(
-            packless.url, packless.deployment.token, pack=packless.pack
-        ) as client:
-            key, probe = new_holder_key(), await client.lift(photo(1, 2))
-            enrolled = await client.enroll("emil", [photo(1, 0), photo(1, 1)], holder_key=key)
-            assert enrolled.holder_key
-            assert await client.verify("emil", probe, holder_key=key)
-            assert not await client.verify("emil", probe)
-            assert (await client.erase("emil")).held
-
-    asyncio.run(scenario())
+def test_a_holders_key_locks_a_lift(packless: Running) -> None:
+    with PrivateClient(packless.url, packless.deployment.token, pack=packless.pack) as client:
+        key, probe = new_holder_key(), client.lift(photo(1, 2))
+        assert client.enroll("emil", [photo(1, 0), photo(1, 1)], holder_key=key).holder_key
+        assert client.verify("emil", probe, holder_key=key)
+        assert not client.verify("emil", probe)
+        assert client.erase("emil").held
 
 
 def test_an_enrollment_is_repeated_with_its_lift(packless: Running) -> None:

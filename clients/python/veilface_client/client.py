@@ -8,7 +8,6 @@ import ssl
 import time
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
 from functools import update_wrapper
-from types import TracebackType
 from typing import Any, Concatenate, ParamSpec, Self, TypedDict, TypeVar, Unpack, get_args
 
 import httpx
@@ -38,21 +37,18 @@ class Options(TypedDict, total=False):
         When and how often a call is sent again.
     verify
         As for httpx: whom to trust with TLS.
+    transport
+        As for httpx: how requests travel, for tests.
     """
 
     timeout: httpx.Timeout | float
     retries: Retries
     verify: ssl.SSLContext | bool
+    transport: Any
 
 
 def _connection(url: str, token: str, options: Options) -> dict[str, Any]:
-    """Return the arguments of httpx's clients.
-
-    Raises
-    ------
-    ValueError
-        The URL or the key cannot be one. The text repeats neither.
-    """
+    """Return the arguments of httpx's clients; a `ValueError` repeats neither URL nor key."""
     try:
         base = httpx.URL(url)
     except httpx.InvalidURL:
@@ -67,6 +63,7 @@ def _connection(url: str, token: str, options: Options) -> dict[str, Any]:
         "headers": {"Authorization": f"Bearer {token}", "Accept": "application/json, */*"},
         "timeout": options.get("timeout", httpx.Timeout(60.0, connect=5.0, pool=5.0)),
         "verify": options.get("verify", True),
+        "transport": options.get("transport"),
         "limits": _LIMITS,
         "follow_redirects": False,
     }
@@ -106,9 +103,9 @@ def _described(method: M, flow: Callable[..., Flow[Any]]) -> M:
 class _Session:
     """A blocking client's connections, and the calls that carry no face."""
 
-    def __init__(self, flows: Flows, http: httpx.Client) -> None:
+    def __init__(self, url: str, token: str, flows: Flows, options: Options) -> None:
         self._flows = flows
-        self._http = http
+        self._http = httpx.Client(**_connection(url, token, options))
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({str(self._http.base_url)!r})"
@@ -116,12 +113,7 @@ class _Session:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -130,11 +122,12 @@ class _Session:
 
     def subjects(self, *, page_size: int = 100) -> Iterator[results.Subject]:
         """Iterate over all subjects, in the order of their ids, a page at a time."""
-        page = self.page(limit=page_size)
-        yield from page.subjects
-        while page.next_cursor is not None:
-            page = self.page(limit=page_size, cursor=page.next_cursor)
+        cursor: str | None = None
+        while True:
+            page = self.page(limit=page_size, cursor=cursor)
             yield from page.subjects
+            if (cursor := page.next_cursor) is None:
+                return
 
     page = _blocking(Flows.page)
     describe = _blocking(Flows.describe)
@@ -174,9 +167,9 @@ class _Session:
 class _AsyncSession:
     """As :class:`_Session`, on asyncio."""
 
-    def __init__(self, flows: Flows, http: httpx.AsyncClient) -> None:
+    def __init__(self, url: str, token: str, flows: Flows, options: Options) -> None:
         self._flows = flows
-        self._http = http
+        self._http = httpx.AsyncClient(**_connection(url, token, options))
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({str(self._http.base_url)!r})"
@@ -184,12 +177,7 @@ class _AsyncSession:
     async def __aenter__(self) -> Self:
         return self
 
-    async def __aexit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         await self.close()
 
     async def close(self) -> None:
@@ -199,13 +187,12 @@ class _AsyncSession:
     async def subjects(self, *, page_size: int = 100) -> AsyncIterator[results.Subject]:
         """Iterate over all subjects, in the order of their ids, a page at a time."""
         cursor: str | None = None
-        more = True
-        while more:
+        while True:
             page = await self.page(limit=page_size, cursor=cursor)
             for subject in page.subjects:
                 yield subject
-            cursor = page.next_cursor
-            more = cursor is not None
+            if (cursor := page.next_cursor) is None:
+                return
 
     page = _asynchronous(Flows.page)
     describe = _asynchronous(Flows.describe)
@@ -251,10 +238,8 @@ class Client(_Session):
         Where the service is: ``https://faces.example.org``.
     token
         An API key.
-    transport
-        As for httpx: how requests travel, for tests.
     options
-        ``timeout``, ``retries`` and ``verify``: see :class:`Options`.
+        See :class:`Options`.
 
     Examples
     --------
@@ -266,18 +251,8 @@ class Client(_Session):
                 ...
     """
 
-    def __init__(
-        self,
-        url: str,
-        token: str,
-        *,
-        transport: httpx.BaseTransport | None = None,
-        **options: Unpack[Options],
-    ) -> None:
-        super().__init__(
-            PhotoFlows(options.get("retries", Retries())),
-            httpx.Client(transport=transport, **_connection(url, token, options)),
-        )
+    def __init__(self, url: str, token: str, **options: Unpack[Options]) -> None:
+        super().__init__(url, token, PhotoFlows(options.get("retries")), options)
 
     enroll = _blocking(PhotoFlows.enroll)
     challenge = _blocking(PhotoFlows.challenge)
@@ -288,11 +263,11 @@ class Client(_Session):
 class PrivateClient(_Session):
     """Embeds and lifts in this process, and sends private templates only.
 
-    Needs the extra ``private``; :class:`LiftUnavailable` where it is not installed.
+    Needs the extra ``private``; :class:`LiftFailed` where it is not installed.
 
     Parameters
     ----------
-    url, token, transport, options
+    url, token, options
         As for :class:`Client`. The key needs the right ``embeddings``.
     pack
         The model pack of the service's contract.
@@ -307,13 +282,10 @@ class PrivateClient(_Session):
         *,
         pack: str | os.PathLike[str],
         dim: int | None = None,
-        transport: httpx.BaseTransport | None = None,
         **options: Unpack[Options],
     ) -> None:
-        super().__init__(
-            PrivateFlows(options.get("retries", Retries()), Lifter(pack, dim=dim)),
-            httpx.Client(transport=transport, **_connection(url, token, options)),
-        )
+        flows = PrivateFlows(options.get("retries"), Lifter(pack, dim=dim))
+        super().__init__(url, token, flows, options)
 
     enroll = _blocking(PrivateFlows.enroll)
     verify = _blocking(PrivateFlows.verify)
@@ -324,44 +296,10 @@ class PrivateClient(_Session):
 class AsyncClient(_AsyncSession):
     """As :class:`Client`, on asyncio."""
 
-    def __init__(
-        self,
-        url: str,
-        token: str,
-        *,
-        transport: httpx.AsyncBaseTransport | None = None,
-        **options: Unpack[Options],
-    ) -> None:
-        super().__init__(
-            PhotoFlows(options.get("retries", Retries())),
-            httpx.AsyncClient(transport=transport, **_connection(url, token, options)),
-        )
+    def __init__(self, url: str, token: str, **options: Unpack[Options]) -> None:
+        super().__init__(url, token, PhotoFlows(options.get("retries")), options)
 
     enroll = _asynchronous(PhotoFlows.enroll)
     challenge = _asynchronous(PhotoFlows.challenge)
     verify = _asynchronous(PhotoFlows.verify)
     compare = _asynchronous(PhotoFlows.compare)
-
-
-class AsyncPrivateClient(_AsyncSession):
-    """As :class:`PrivateClient`, on asyncio; lifting runs in a thread."""
-
-    def __init__(
-        self,
-        url: str,
-        token: str,
-        *,
-        pack: str | os.PathLike[str],
-        dim: int | None = None,
-        transport: httpx.AsyncBaseTransport | None = None,
-        **options: Unpack[Options],
-    ) -> None:
-        super().__init__(
-            PrivateFlows(options.get("retries", Retries()), Lifter(pack, dim=dim)),
-            httpx.AsyncClient(transport=transport, **_connection(url, token, options)),
-        )
-
-    enroll = _asynchronous(PrivateFlows.enroll)
-    verify = _asynchronous(PrivateFlows.verify)
-    lift_enrollment = _asynchronous(PrivateFlows.lift_enrollment)
-    lift = _asynchronous(PrivateFlows.lift)

@@ -4,26 +4,21 @@
 
     VeilfaceError
     ├── ServiceError            the service answered with an error: .code, .status, .details …
-    │   ├── InvalidRequest      the request itself: malformed, unknown field, too large
     │   ├── PhotoRefused        a better photo heals it: no face, several, too small, blurred …
     │   ├── Unauthorized        the API key or token
     │   ├── Forbidden           a right that the API key lacks
-    │   ├── NotFound
-    │   │   └── NotEnrolled
-    │   ├── Conflict
-    │   │   ├── ContractMismatch
-    │   │   └── EnrollmentConflict
+    │   ├── NotEnrolled
+    │   ├── ContractMismatch
+    │   ├── EnrollmentConflict
     │   ├── LockedOut           wait .retry_after, and offer another factor
     │   ├── RateLimited
-    │   └── ServerFailed        a defect of the service
-    │       └── Unavailable     no pack, no database, or too much to do
+    │   └── Unavailable         no pack, no database, or too much to do
     ├── ConnectionFailed        no answer: .sent says whether the request may have been done
     ├── UnexpectedAnswer        an answer that is not the service's
     └── LiftFailed              no template was made on this machine: .message
-        └── LiftUnavailable     what makes it is not installed
 
-A code that this version does not know gives the class of its status. No error repeats the API key,
-a photo, or a template.
+All other codes are plain `ServiceError`s, or have the class of their status. No error repeats the
+API key, a photo, or a template.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -88,10 +83,6 @@ class ServiceError(VeilfaceError):
         self.retry_after = retry_after
 
 
-class InvalidRequest(ServiceError):
-    """The request is wrong, and will be every time."""
-
-
 class PhotoRefused(ServiceError):
     """A photo does not serve; ``details["image"]`` is its position in an enrollment."""
 
@@ -104,23 +95,15 @@ class Forbidden(ServiceError):
     """The API key lacks a right: ``details["missing"]``."""
 
 
-class NotFound(ServiceError):
-    """There is nothing to return."""
-
-
-class NotEnrolled(NotFound):
+class NotEnrolled(ServiceError):
     """Nobody is enrolled under this id."""
 
 
-class Conflict(ServiceError):
-    """What the request builds on is not so."""
-
-
-class ContractMismatch(Conflict):
+class ContractMismatch(ServiceError):
     """A template of another contract."""
 
 
-class EnrollmentConflict(Conflict):
+class EnrollmentConflict(ServiceError):
     """The subject has another template than may be replaced; ``details["template_id"]`` is it."""
 
 
@@ -132,11 +115,7 @@ class RateLimited(ServiceError):
     """Too many requests with this API key or from this address."""
 
 
-class ServerFailed(ServiceError):
-    """The service failed."""
-
-
-class Unavailable(ServerFailed):
+class Unavailable(ServiceError):
     """The service cannot do it now."""
 
 
@@ -160,10 +139,6 @@ class LiftFailed(VeilfaceError):
         self.message = message
 
 
-class LiftUnavailable(LiftFailed):
-    """The package ``veilface`` is not installed, or cannot be imported in this process."""
-
-
 _BY_CODE: dict[str, type[ServiceError]] = {
     "not_enrolled": NotEnrolled,
     "contract_mismatch": ContractMismatch,
@@ -179,8 +154,6 @@ _BY_CODE: dict[str, type[ServiceError]] = {
 _BY_STATUS: dict[int, type[ServiceError]] = {
     401: Unauthorized,
     403: Forbidden,
-    404: NotFound,
-    409: Conflict,
     423: LockedOut,
     429: RateLimited,
     502: Unavailable,
@@ -191,8 +164,7 @@ _BY_STATUS: dict[int, type[ServiceError]] = {
 
 def error_class(code: str, status: int) -> type[ServiceError]:
     """Return the class of an error code, or of the status where the code has none of its own."""
-    fallback = InvalidRequest if status < 500 else ServerFailed
-    return _BY_CODE.get(code) or _BY_STATUS.get(status, fallback)
+    return _BY_CODE.get(code) or _BY_STATUS.get(status, ServiceError)
 
 
 def error_of(response: httpx.Response) -> VeilfaceError:

@@ -102,8 +102,8 @@ def new_holder_key() -> bytes:
 class Flows:
     """The calls that carry no face."""
 
-    def __init__(self, retries: Retries) -> None:
-        self._retries = retries
+    def __init__(self, retries: Retries | None) -> None:
+        self._retries = retries or Retries()
 
     def page(self, *, limit: int = 100, cursor: str | None = None) -> Flow[results.SubjectPage]:
         """List one page of subjects. Right: ``enroll``."""
@@ -323,9 +323,10 @@ class PhotoFlows(Flows):
 class PrivateFlows(Flows):
     """The calls of a client that never sends a face: it lifts here, and sends templates."""
 
-    def __init__(self, retries: Retries, lifter: Lifter) -> None:
+    def __init__(self, retries: Retries | None, lifter: Lifter) -> None:
         super().__init__(retries)
         self._lifter = lifter
+        self._is_current = True
 
     def enroll(
         self,
@@ -383,7 +384,8 @@ class PrivateFlows(Flows):
 
     def _lift(self, kind: type[L], photos: Photos, face: Face | None) -> Flow[L]:
         pictures: list[bytes] = yield lambda: read_photos(photos)
-        inputs = self._lifter.inputs or (yield from self._fetch())
+        inputs = self._lifter.inputs if self._is_current else None
+        inputs = inputs or (yield from self._fetch())
         lift: L = yield lambda: self._lifter.lift(kind, inputs, pictures, face)
         return lift
 
@@ -394,20 +396,24 @@ class PrivateFlows(Flows):
         face: Face | None,
         send: Callable[[dict[str, str]], Flow[T]],
     ) -> Flow[T]:
-        """Send a lift, or a new one under the contract that the service has changed to."""
+        """Send a lift. A resend repeats it; the error that ends it has it, so that callers can."""
         if isinstance(photos, kind):
-            return (yield from _send_lift(photos, send))
-        pictures: list[bytes] = yield lambda: read_photos(cast("Photos", photos))
-        lift = yield from self._lift(kind, pictures, face)
+            lift = photos
+        else:
+            lift = yield from self._lift(kind, cast("Photos", photos), face)
         try:
-            return (yield from _send_lift(lift, send))
+            return (yield from send({"template": base64.b64encode(lift.template).decode("ascii")}))
         except ContractMismatch:
-            inputs = yield from self._fetch()
-            if inputs.contract_id == lift.contract_id:
-                # It is the subject's stored template that is of another contract.
-                raise
-        lift = yield lambda: self._lifter.lift(kind, inputs, pictures, face)
-        return (yield from _send_lift(lift, send))
+            # Not lifted again here: a service that only claims to have changed would get two lifts.
+            self._is_current = False
+            raise
+        except VeilfaceError as error:
+            error.lift = lift
+            error.add_note(
+                "The service may have this lift: repeat the call with the error's `lift`, never "
+                "with the photo. Two lifts of one photo give the embedding away."
+            )
+            raise
 
     def _fetch(self) -> Flow[LiftInputs]:
         for _ in range(3):
@@ -416,23 +422,9 @@ class PrivateFlows(Flows):
             # The contract may have changed between the two answers, or between two workers.
             if generator.source_id == contract.binding.get("decoy_source_id"):
                 inputs: LiftInputs = yield partial(self._lifter.keep, contract, generator)
+                self._is_current = True
                 return inputs
         raise UnexpectedAnswer("the generator of the service is not that of its contract")
-
-
-def _send_lift(lift: results.Lift, send: Callable[[dict[str, str]], Flow[T]]) -> Flow[T]:
-    """Send a lift. A resend repeats it; the error that ends it has it, so that callers can."""
-    try:
-        return (yield from send({"template": base64.b64encode(lift.template).decode("ascii")}))
-    except ContractMismatch:
-        raise
-    except VeilfaceError as error:
-        error.lift = lift
-        error.add_note(
-            "The service may have this lift: repeat the call with the error's `lift`, never with "
-            "the photo. Two lifts of one photo give the embedding away."
-        )
-        raise
 
 
 def _connection_failed(error: httpx.RequestError) -> ConnectionFailed:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from veilface_client.errors import LiftFailed, LiftUnavailable
+from veilface_client.errors import LiftFailed
 from veilface_client.results import Contract, Generator, Lift, Probe
 
 if TYPE_CHECKING:
@@ -51,13 +51,13 @@ class Lifter:
 
     Raises
     ------
-    LiftUnavailable
+    LiftFailed
         The packages are not installed.
     """
 
     def __init__(self, pack: str | os.PathLike[str], *, dim: int | None) -> None:
         if importlib.util.find_spec("veilface") is None:
-            raise LiftUnavailable(f"lifting needs veilface on this machine: {_REMEDY}")
+            raise LiftFailed(f"lifting needs veilface on this machine: {_REMEDY}")
         self.inputs: LiftInputs | None = None
         self._folder = Path(pack)
         self._dim = dim
@@ -73,7 +73,7 @@ class Lifter:
             from templates.decoys import DecoyGenerator
             from templates.errors import VeilfaceError
         except ImportError as error:
-            raise LiftUnavailable(
+            raise LiftFailed(
                 f"veilface cannot be imported here ({error}): {_REMEDY}, and call no package of "
                 "yours enroll, models or templates"
             ) from None
