@@ -31,14 +31,11 @@ from api.http.openapi import ERRORS, allowed_methods, describe, operation_id
 from api.http.routes import (
     audit_log,
     challenges,
-    comparison,
     contract,
     enrollment,
     health,
-    lockout,
-    own_key,
     pack,
-    photo_check,
+    photos,
     subjects,
     tokens,
     transfer,
@@ -65,16 +62,13 @@ from templates.errors import VeilfaceError
 VERSION = version("veilface")
 API = (
     verification,  # asked most, so looked at first
-    own_key,
     contract,
     pack,
     tokens,
     enrollment,
-    comparison,
-    photo_check,
+    photos,
     subjects,
     challenges,
-    lockout,
     audit_log,
     transfer,
     health,

@@ -36,12 +36,7 @@ HeaderDep = Annotated[str | None, Security(_header)]
 class Call:
     """A call whose API key was recognised, and what answers it.
 
-    Attributes
-    ----------
-    key
-        The API key, or the one that made the token.
-    token
-        What the call's token is good for; None where it came with the API key itself.
+    ``key`` is the API key, or the one that made the ``token``, where the call came with one.
     """
 
     request: Request = field(repr=False)
@@ -92,13 +87,7 @@ class Call:
         return {"request_id": self.request.state.request_id, "notice": notice}
 
     def require(self, *rights: str) -> None:
-        """Refuse unless the caller has one of these rights.
-
-        Raises
-        ------
-        ApiError
-            ``forbidden``; it names the rights.
-        """
+        """Refuse unless the caller has one of these rights."""
         if not self.rights & {*rights}:
             named = " or ".join(rights)
             raise ApiError(
@@ -137,13 +126,7 @@ async def call_of(
 ) -> Call:
     """Recognise the API key of a request, or a token, which counts for the key that made it.
 
-    Raises
-    ------
-    ApiError
-        ``unauthorized``, in the same words for an absent, an unknown and a revoked key;
-        ``overloaded``; ``rate_limited``; ``forbidden`` for what a token is not for.
-    Replayed
-        Where a token comes too late, or was used.
+    An absent, an unknown and a revoked key are ``unauthorized`` in the same words.
     """
     runtime: Runtime = request.app.state.runtime
     gate: Gate = request.app.state.gate

@@ -35,8 +35,6 @@ BODY_TIMEOUT_S = 60.0
 MAX_JSON_PARTS = 24_576
 """Values in a JSON body, counted before it is parsed: six of the longest embeddings, where no
 request has more than five. Without it 4 MiB of small objects take 120 MiB."""
-MAX_PARSED_AT_ONCE = 64 * 1024
-"""Bytes of JSON that are parsed on the event loop; more go to a thread."""
 
 B = TypeVar("B", bound=Body)
 
@@ -94,7 +92,7 @@ class _InMemoryParser(MultiPartParser):
 
 
 def too_many_images(most: int) -> ApiError:
-    """Return the refusal of more photos than a call takes."""
+    """Refuse more photos than a call takes."""
     photos = "photo" if most == 1 else "photos"
     return ApiError("too_many_images", f"at most {most} {photos} in one request", {"limit": most})
 
@@ -109,7 +107,6 @@ def _media_type(request: Request) -> str:
 
 
 def _require_type(request: Request, media_type: str, how: str) -> None:
-    """Refuse a body of another type, in words that say what came and what to send."""
     if request.headers.get("content-encoding", "identity").lower() != "identity":
         raise ApiError(
             "malformed_request", "the body is compressed: send it without a Content-Encoding"
@@ -123,20 +120,7 @@ def _require_type(request: Request, media_type: str, how: str) -> None:
 
 
 async def read_form(request: Request, model: type[B], *, photos: str, most: int) -> B:
-    """Read a multipart body.
-
-    Parameters
-    ----------
-    model
-        What the form holds.
-    photos, most
-        Field that photos are sent in, and how many may come.
-
-    Raises
-    ------
-    ApiError
-        ``malformed_request``, ``validation_failed`` or one of the 413 codes.
-    """
+    """Read a multipart body; `photos` is the field that they are sent in, `most` how many."""
     _require_type(request, _FORM, how_to_send(photos))
     with _arrives_within(BODY_TIMEOUT_S):
         try:
@@ -164,23 +148,9 @@ async def read_form(request: Request, model: type[B], *, photos: str, most: int)
 
 
 async def read_json(request: Request, model: type[B], *, photos: str | None = None) -> B:
-    """Read a JSON object, in UTF-8.
+    """Read a JSON object, in UTF-8; `photos` is the multipart field, where a call takes these too.
 
     ``NaN`` and infinities pass, so that an embedding that holds them is refused as such.
-
-    Parameters
-    ----------
-    model
-        What the object holds.
-    photos
-        Multipart field for photos, where the call takes these too.
-
-    Raises
-    ------
-    ApiError
-        ``malformed_request``, ``request_too_large`` or ``validation_failed``.
-    InvalidEmbedding, InvalidTemplate
-        A field that should hold one does not.
     """
     how = "send JSON as application/json"
     if photos is not None:
@@ -192,9 +162,7 @@ async def read_json(request: Request, model: type[B], *, photos: str | None = No
         raise ApiError(
             "malformed_request", f"the body holds more than {MAX_JSON_PARTS} values or commas"
         )
-    if len(body) > MAX_PARSED_AT_ONCE:
-        return await anyio.to_thread.run_sync(_parsed, model, body, photos)
-    return _parsed(model, body, photos)
+    return await anyio.to_thread.run_sync(_parsed, model, body, photos)
 
 
 def _parsed(model: type[B], body: bytes, photos: str | None) -> B:
@@ -229,7 +197,6 @@ def _checked(model: type[B], values: Mapping[str, Any], photos: str | None) -> B
 
 @contextmanager
 def _arrives_within(seconds: float) -> Iterator[None]:
-    """Bound the time that a body may take to arrive."""
     try:
         with anyio.fail_after(seconds):
             yield

@@ -32,25 +32,11 @@ HEALTH_PATHS = frozenset({"/health/live", "/health/ready"})
 """Paths without a rate limit: what watches the service must see an overload."""
 
 
-def request_id_of(offered: str | None) -> str:
-    """Return the client's request id if it is sane, or a fresh one."""
-    if offered is not None and SANE_REQUEST_ID.fullmatch(offered):
-        return offered
-    return secrets.token_hex(16)
-
-
 class RequestContext:
     """ASGI middleware; it sits outside of all exception handlers.
 
-    ``scope["state"]`` gets ``request_id`` and ``log``, a dictionary of fields for the request's
-    log line that routes may add to.
-
-    Parameters
-    ----------
-    root_path
-        Path under which a proxy shows the service, which a request may have or not.
-    demo, tls
-        What the headers of every answer say.
+    ``scope["state"]`` gets ``request_id`` and ``log``, fields of the request's log line that routes
+    may add to. `root_path` is the path under which a proxy shows the service.
     """
 
     def __init__(
@@ -72,7 +58,9 @@ class RequestContext:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        request_id = request_id_of(Headers(scope=scope).get("x-request-id"))
+        request_id = Headers(scope=scope).get("x-request-id", "")
+        if not SANE_REQUEST_ID.fullmatch(request_id):
+            request_id = secrets.token_hex(16)
         fields: dict[str, Any] = {}
         scope.setdefault("state", {}).update(request_id=request_id, log=fields)
         scope["root_path"] = self._root_path

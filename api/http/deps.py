@@ -19,28 +19,16 @@ async def subject_of(
         str, Path(description=f"Subject id: has {SUBJECT_ID_RULE}.", examples=["alice"])
     ],
 ) -> str:
-    """Return the subject id in NFC, and note its pseudonym for the logs.
-
-    Raises
-    ------
-    InvalidIdentifier
-        If it breaks the rule.
-    """
+    """Return the subject id in NFC, and note its pseudonym for the logs."""
     subject_id = checked_subject_id(subject_id)
     call.note_subject(subject_id)
     return subject_id
 
 
 async def refuse_unknown(request: Request) -> None:
-    """Refuse what the route does not read. Fields of bodies are refused where they are read.
+    """Refuse a query or a body that the route does not read.
 
     Every route depends on it. One that is not FastAPI's, as of the page, reads no parameter.
-
-    Raises
-    ------
-    ApiError
-        ``validation_failed``: a query parameter that the route does not declare, that comes twice,
-        or that is not ``name=value`` in UTF-8; or a body where the call takes none.
     """
     dependant = getattr(request.scope["route"], "dependant", None)
     known = [] if dependant is None else [field.alias for field in dependant.query_params]
@@ -62,13 +50,7 @@ async def refuse_unknown(request: Request) -> None:
 
 
 async def refuse_body(request: Request) -> None:
-    """Refuse a body where the call takes none.
-
-    Raises
-    ------
-    ApiError
-        ``validation_failed``.
-    """
+    """Refuse a body where the call takes none."""
     headers = request.headers
     sent = headers.get("content-length", "0") != "0" or "transfer-encoding" in headers
     if sent and request.method in ("GET", "HEAD", "DELETE"):
@@ -92,13 +74,7 @@ async def precondition_of(
         ),
     ] = None,
 ) -> Precondition | None:
-    """Return what the subject must have for a write; None where the request does not say.
-
-    Raises
-    ------
-    ApiError
-        ``validation_failed`` for any other use of the two headers.
-    """
+    """Return what the subject must have for a write; None where the request does not say."""
     sent = request.headers.getlist("If-None-Match") + request.headers.getlist("If-Match")
     if not sent:
         return None
@@ -114,13 +90,7 @@ async def precondition_of(
 
 
 async def refuse_precondition(request: Request) -> None:
-    """Refuse the two headers where nothing heeds them: the write would happen regardless.
-
-    Raises
-    ------
-    ApiError
-        ``validation_failed``.
-    """
+    """Refuse the two headers where nothing heeds them: the write would happen regardless."""
     if "If-None-Match" in request.headers or "If-Match" in request.headers:
         raise _precondition_refused("this call takes neither: send it without them")
 

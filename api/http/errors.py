@@ -5,10 +5,13 @@ An error body has one shape, framework errors included::
     {"error": {"code": "no_face", "message": "…", "details": {…}}, "request_id": "…"}
 """
 
+import json
 import math
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
+
+from pydantic_core import to_json
 
 from models.errors import FaceError, ImageError, ModelError, PhotoRejected
 from templates.errors import (
@@ -37,86 +40,69 @@ class DatabaseAway(StartError):
     """The database does not answer now; it may later."""
 
 
-@dataclass(frozen=True)
-class ErrorCode:
-    """One code: its status, and what it means."""
+class ErrorCode(NamedTuple):
+    """Status of a code, and what it means."""
 
-    code: str
     status: int
     meaning: str
 
 
-_CODES = (
-    ErrorCode(
-        "malformed_request",
-        400,
-        "The body does not match its content type, or the request is not well-formed HTTP.",
+ERROR_CODES = {
+    "malformed_request": ErrorCode(
+        400, "The body does not match its content type, or the request is not well-formed HTTP."
     ),
-    ErrorCode("unsupported_image", 400, "The photo cannot be decoded safely."),
-    ErrorCode(
-        "invalid_template",
-        400,
-        "The template does not follow the format or exceeds its limits.",
+    "unsupported_image": ErrorCode(400, "The photo cannot be decoded safely."),
+    "invalid_template": ErrorCode(
+        400, "The template does not follow the format or exceeds its limits."
     ),
-    ErrorCode(
-        "invalid_embedding",
+    "invalid_embedding": ErrorCode(
         400,
         "The embedding is not a finite unit vector of n numbers, or has no part along the "
         "contract's axes.",
     ),
-    ErrorCode("unauthorized", 401, "The API key or token is missing, unknown or revoked."),
-    ErrorCode("replayed", 401, "The challenge or the token was used before, or has expired."),
-    ErrorCode(
-        "forbidden",
+    "unauthorized": ErrorCode(401, "The API key or token is missing, unknown or revoked."),
+    "replayed": ErrorCode(401, "The challenge or the token was used before, or has expired."),
+    "forbidden": ErrorCode(
         403,
         "The API key lacks the right or asks for too low a level, the token is for something "
         "else, the tenant forbids it, or liveness is asked for and the probe cannot show it.",
     ),
-    ErrorCode("not_enrolled", 404, "Nobody is enrolled under this id."),
-    ErrorCode(
-        "not_found",
+    "not_enrolled": ErrorCode(404, "Nobody is enrolled under this id."),
+    "not_found": ErrorCode(
         404,
         "There is nothing at this path, or nothing to give: no failed attempts, generator, graph, "
         "challenge or export.",
     ),
-    ErrorCode("method_not_allowed", 405, "The path exists, but not with this method."),
-    ErrorCode("contract_mismatch", 409, "The template belongs to another contract."),
-    ErrorCode(
-        "enrollment_conflict",
+    "method_not_allowed": ErrorCode(405, "The path exists, but not with this method."),
+    "contract_mismatch": ErrorCode(409, "The template belongs to another contract."),
+    "enrollment_conflict": ErrorCode(
         409,
         "The subject has another template than the one that `If-None-Match` or `If-Match` "
         "lets the request replace.",
     ),
-    ErrorCode("image_too_large", 413, "The photo is too large, in bytes or pixels."),
-    ErrorCode("request_too_large", 413, "The request body is too large."),
-    ErrorCode("too_many_images", 413, "The request has too many photos."),
-    ErrorCode("no_face", 422, "No face was found in the photo."),
-    ErrorCode(
-        "multiple_faces",
-        422,
-        "The photo shows several faces, and none is clearly the one that is meant.",
+    "image_too_large": ErrorCode(413, "The photo is too large, in bytes or pixels."),
+    "request_too_large": ErrorCode(413, "The request body is too large."),
+    "too_many_images": ErrorCode(413, "The request has too many photos."),
+    "no_face": ErrorCode(422, "No face was found in the photo."),
+    "multiple_faces": ErrorCode(
+        422, "The photo shows several faces, and none is clearly the one that is meant."
     ),
-    ErrorCode("face_too_small", 422, "The face is too small in the photo."),
-    ErrorCode(
-        "low_quality",
-        422,
-        "The photo is turned, blurred or dark, the pose extreme, or part of the face hidden.",
+    "face_too_small": ErrorCode(422, "The face is too small in the photo."),
+    "low_quality": ErrorCode(
+        422, "The photo is turned, blurred or dark, the pose extreme, or part of the face hidden."
     ),
-    ErrorCode("inconsistent_images", 422, "The photos do not all show the same person."),
-    ErrorCode("uncalibrated", 422, "The contract has no calibration for what was asked."),
-    ErrorCode("validation_failed", 422, "A field is missing, unknown, or has a wrong value."),
-    ErrorCode("locked_out", 423, "Too many failed attempts for this subject."),
-    ErrorCode("rate_limited", 429, "Too many requests with this API key or from this address."),
-    ErrorCode("internal_error", 500, "A bug in the service: report the request id."),
-    ErrorCode(
-        "model_unavailable",
-        503,
-        "The service runs without a model pack, or the model failed on this request.",
+    "inconsistent_images": ErrorCode(422, "The photos do not all show the same person."),
+    "uncalibrated": ErrorCode(422, "The contract has no calibration for what was asked."),
+    "validation_failed": ErrorCode(422, "A field is missing, unknown, or has a wrong value."),
+    "locked_out": ErrorCode(423, "Too many failed attempts for this subject."),
+    "rate_limited": ErrorCode(429, "Too many requests with this API key or from this address."),
+    "internal_error": ErrorCode(500, "A bug in the service: report the request id."),
+    "model_unavailable": ErrorCode(
+        503, "The service runs without a model pack, or the model failed on this request."
     ),
-    ErrorCode("store_unavailable", 503, "The database does not respond."),
-    ErrorCode("overloaded", 503, "Too many requests are waiting, or the worker is stopping."),
-)
-ERROR_CODES = {entry.code: entry for entry in _CODES}
+    "store_unavailable": ErrorCode(503, "The database does not respond."),
+    "overloaded": ErrorCode(503, "Too many requests are waiting, or the worker is stopping."),
+}
 
 
 @dataclass(eq=False)
@@ -139,7 +125,6 @@ class ApiError(Exception):
         return ERROR_CODES[self.code].status
 
 
-UNAVAILABLE_HEADERS = {"Retry-After": "5"}
 DISABLED_RETRY_AFTER_S = 86_400
 """What a client is told of a subject that waits for an operator: to ask again in a day."""
 
@@ -147,9 +132,8 @@ DISABLED_RETRY_AFTER_S = 86_400
 def api_error(error: Exception) -> ApiError | None:
     """Give an exception of the packages below its code; None for one that is not expected.
 
-    The text of a client's mistake is passed on: the packages below put no number of an embedding
-    or template and no key into a message. The text of a failure of the service is not passed on,
-    because it may name a file or a host.
+    The text of a client's mistake is passed on: it holds no number of an embedding or template, and
+    no key. The text of a failure of the service is not, because it may name a file or a host.
     """
     if isinstance(error, ApiError):
         return error
@@ -170,13 +154,8 @@ def api_error(error: Exception) -> ApiError | None:
         return ApiError("enrollment_conflict", str(error), {"template_id": error.template_id})
     for kind, code, public in _TABLE:
         if isinstance(error, kind):
-            status = ERROR_CODES[code].status
-            return ApiError(
-                code,
-                str(error) if public is None else public,
-                {},
-                UNAVAILABLE_HEADERS if status == 503 else {},
-            )
+            wait = {"Retry-After": "5"} if ERROR_CODES[code].status == 503 else {}
+            return ApiError(code, public or str(error), {}, wait)
     return None
 
 
@@ -214,14 +193,7 @@ _WORDS = {
 
 
 def wrong_value(problem: Mapping[str, Any], remedy: str = "") -> ApiError:
-    """Name the parameter or field that pydantic refused, and its bounds; never what was sent.
-
-    Parameters
-    ----------
-    problem
-        Of pydantic: ``loc``, ``type`` and perhaps ``ctx``. An error that a validator of ours
-        raised is passed on: its text repeats no value.
-    """
+    """Name the parameter or field that pydantic refused, and its bounds; never what was sent."""
     name = str(problem["loc"][-1]) if problem["loc"] else None
     bounds = problem.get("ctx", {})
     said = [words.format(bounds[bound]) for bound, words in _WORDS.items() if bound in bounds]
@@ -237,14 +209,9 @@ def wrong_value(problem: Mapping[str, Any], remedy: str = "") -> ApiError:
 def refuse_unknown_names(
     sent: Iterable[str], known: Collection[str], what: str, remedy: str = ""
 ) -> None:
-    """Refuse names that a call does not read: a misspelt `level` must not pass as the default.
+    """Refuse query parameters, form fields and JSON keys that a call does not read.
 
-    This is the one rule for query parameters, form fields and JSON keys.
-
-    Raises
-    ------
-    ApiError
-        ``validation_failed``; it lists the known names, and ends as `remedy` says.
+    A misspelt `level` must not pass as the default. The refusal lists the known names.
     """
     if not set(sent) <= set(known):
         raise ApiError(
@@ -258,16 +225,10 @@ def plain_details(details: Mapping[str, Any]) -> dict[str, Any]:
     """Return details as JSON values: numbers of NumPy become Python's, the rest becomes text."""
 
     def plain(value: Any) -> Any:
-        if isinstance(value, Mapping):
-            return {str(key): plain(entry) for key, entry in value.items()}
-        if isinstance(value, list | tuple):
-            return [plain(entry) for entry in value]
-        if value is None or isinstance(value, bool | int | str):
-            return value
         try:
-            number = float(value)
+            return float(value)
         except (TypeError, ValueError):
             return str(value)
-        return number if math.isfinite(number) else None
 
-    return {str(key): plain(value) for key, value in details.items()}
+    plainly: dict[str, Any] = json.loads(to_json(details, inf_nan_mode="null", fallback=plain))
+    return plainly

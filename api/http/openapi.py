@@ -65,10 +65,8 @@ def _schema_of(model: type[BaseModel]) -> dict[str, Any]:
 
 
 def allowed_methods(document: Mapping[str, Any], path: str) -> list[str]:
-    """Return the methods of a path, by the OpenAPI document; the framework names one route's only.
-
-    Where two paths fit, the one that is written out is meant: `/v1/subjects/import`.
-    """
+    """Return the methods of a path, by the document; the framework names one route's only."""
+    # Where two paths fit, the one that is written out is meant: `/v1/subjects/import`.
     fitting = [
         template
         for template in document["paths"]

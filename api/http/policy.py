@@ -12,19 +12,7 @@ class Levels:
     """The levels of one contract, and the lowest that the deployment decides at.
 
     A level is lower than another one if its false match rate is larger: its target, or where it has
-    none the upper bound of what was seen.
-
-    Parameters
-    ----------
-    contract
-        Whose calibrations have the levels.
-    lowest
-        Name of the deployment's lowest level; None for any.
-
-    Raises
-    ------
-    StartError
-        The contract has no such level.
+    none the upper bound of what was seen. A lowest one that the contract lacks is a `StartError`.
     """
 
     def __init__(self, contract: Contract, *, lowest: str | None) -> None:
@@ -42,25 +30,9 @@ class Levels:
         self._lowest = lowest
 
     def in_force(self, asked: str | None, *, lowest_of_key: str | None = None) -> str:
-        """Return the level to decide at.
+        """Return the level to decide at: the default, or the lowest allowed if that is stricter.
 
-        Where the request asks for no level, that is the contract's default, or the lowest allowed
-        if the default is below it.
-
-        Parameters
-        ----------
-        asked
-            By the client; None for the default.
-        lowest_of_key
-            Name of the lowest level of the API key; None for any.
-
-        Raises
-        ------
-        Uncalibrated
-            The contract does not have the level.
-        ApiError
-            ``forbidden``: the level is below the lowest allowed, or the contract does not have the
-            key's lowest.
+        A level that was `asked` for and is below the lowest allowed is ``forbidden``.
         """
         level = asked or self._default
         if level not in self._rates:
@@ -99,17 +71,8 @@ def _rate(level: Level) -> float:
 class LivenessRules:
     """The liveness policy of a deployment, which binds every caller.
 
-    Parameters
-    ----------
-    policy
-        What every verification must pass.
-    contract, pack
-        What the service checks with. The liveness graphs are loaded only where the policy asks.
-
-    Raises
-    ------
-    StartError
-        The policy asks for what contract and pack cannot tell.
+    A policy that asks for what contract and pack cannot tell is a `StartError`. The liveness graphs
+    are loaded only where the policy asks.
     """
 
     def __init__(self, policy: LivenessPolicy, contract: Contract, pack: ModelPack | None) -> None:
@@ -124,31 +87,12 @@ class LivenessRules:
             raise StartError(f"setting liveness asks for {policy}: {lacking}")
 
     def require_challenges(self) -> None:
-        """Refuse a challenge that the service could not hold frames against.
-
-        Raises
-        ------
-        ApiError
-            ``not_found``.
-        """
+        """Refuse a challenge that the service could not hold frames against."""
         if not self._has_detector:
             raise ApiError("not_found", _NO_DETECTOR)
 
     def require(self, *, photos: bool, challenge: bool) -> None:
-        """Refuse a probe that cannot show what the policy asks for.
-
-        Parameters
-        ----------
-        photos
-            Whether the probe is photos, or frames; embeddings and lifted probes show nothing.
-        challenge
-            Whether it answers a challenge.
-
-        Raises
-        ------
-        ApiError
-            ``forbidden``.
-        """
+        """Refuse a probe that cannot show what the policy asks for, as ``forbidden``."""
         details = {"liveness": str(self.policy)}
         if self.policy is not LivenessPolicy.OFF and not photos:
             raise ApiError(

@@ -28,13 +28,7 @@ def receipt_key_json(public_key: bytes) -> dict[str, Any]:
 
 
 def read_receipt_key(entry: Mapping[str, Any]) -> bytes:
-    """Return the public key, 32 bytes, of what :func:`receipt_key_json` wrote.
-
-    Raises
-    ------
-    StoreError
-        For anything else.
-    """
+    """Return the public key, 32 bytes, of what :func:`receipt_key_json` wrote."""
     try:
         return base64.b64decode(entry["public_key"], validate=True)
     except (KeyError, TypeError, ValueError):
@@ -42,20 +36,10 @@ def read_receipt_key(entry: Mapping[str, Any]) -> bytes:
 
 
 def verify_answer(answer: Mapping[str, Any], public_key: bytes) -> dict[str, Any]:
-    """Verify the answer of an erasure, or its ``receipt`` alone; returns what was signed.
+    """Verify the answer of an erasure, or its ``receipt`` alone; return what was signed.
 
-    Parameters
-    ----------
-    answer
-        The JSON object as the service returned it. ``claims`` in it is not looked at, because it
-        is not signed.
-    public_key
-        Of ``receipt_key`` in ``GET /v1/contract``.
-
-    Raises
-    ------
-    StoreError
-        If it is no receipt, was signed with another key, or was altered.
+    ``claims`` is not looked at, because it is not signed. A receipt that was altered, or signed
+    with another key, is a `StoreError`.
     """
     receipt = answer.get("receipt", answer)
     if not isinstance(receipt, Mapping):

@@ -51,14 +51,8 @@ class Sealed(BaseModel):
         return base64.urlsafe_b64encode(text).rstrip(b"=").decode("ascii")
 
     def require_in_time(self) -> None:
-        """Refuse what is late.
-
-        Raises
-        ------
-        Replayed
-            Without a line in the audit log: anybody who finds an old token could write there for
-            ever.
-        """
+        """Refuse what is late."""
+        # Unrecorded: anybody who finds an old token could fill the audit log with it.
         if self.expires_at < datetime.now(UTC):
             raise Replayed("it has expired: ask for another one", recorded=True)
 
@@ -83,20 +77,9 @@ def ends_in(seconds: int) -> datetime:
 
 
 class SubjectToken(Sealed):
-    """What a token is good for.
+    """What a token is good for: one action on one subject, at one level if it is a verification.
 
-    Attributes
-    ----------
-    subject, action
-        The only subject, and the only thing that is done to it.
-    level
-        Security level of a verification; None for an enrollment.
-    token_id
-        Names it in logs and answers; nothing can be done with it alone.
-    key_prefix
-        Of the API key that asked for it.
-    replace
-        Whether its enrollment may replace an earlier one.
+    ``token_id`` names it in logs and answers; nothing can be done with it alone.
     """
 
     subject: str
@@ -112,26 +95,14 @@ class SubjectToken(Sealed):
         return token_digest(self.key_prefix, self.token_id)
 
     def require(self, route: str, subject: str | None) -> None:
-        """Refuse a call that the token is not for; `subject` is the one that the path names.
-
-        Raises
-        ------
-        ApiError
-            ``forbidden``.
-        """
+        """Refuse a call that the token is not for; `subject` is the one that the path names."""
         if self.action not in CALLS.get(route, ()):
             raise _another("call", f"this token is good to {self.action}, and not for this call")
         if subject is not None and unicodedata.normalize("NFC", subject) != self.subject:
             raise _another("subject", "this token is for another subject")
 
     def level_of(self, asked: str | None) -> str | None:
-        """Return the level to decide at.
-
-        Raises
-        ------
-        ApiError
-            ``forbidden`` where the request asks for another one.
-        """
+        """Return the level to decide at; a request for another one is ``forbidden``."""
         if asked not in (None, self.level):
             raise _another(
                 "level", "this token is for another security level: ask for its own, or for none"
@@ -139,13 +110,7 @@ class SubjectToken(Sealed):
         return self.level
 
     def precondition(self, asked: Precondition | None) -> Precondition | None:
-        """Return what the subject must have for an enrollment.
-
-        Raises
-        ------
-        ApiError
-            ``forbidden`` where the request may replace one, and the token may not.
-        """
+        """Return what the subject must have for an enrollment."""
         if self.replace:
             return asked
         if asked is not None and asked.template_id is not None:
@@ -170,11 +135,7 @@ def new_token(
 ) -> tuple[SubjectToken, str]:
     """Make a token; return it with its text, which is shown once.
 
-    Parameters
-    ----------
-    key_id, key_prefix
-        Row id and prefix of the API key that asks for it. The id is in the database alone, so that
-        the master key does not suffice to make a token.
+    `key_id`, the row of the API key, is in the database alone: the master key makes no token.
     """
     token = SubjectToken(
         subject=subject,

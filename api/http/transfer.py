@@ -32,12 +32,7 @@ PURPOSE = "export"
 class ExportKey:
     """The key of exports: an operator's file, or a secret of this deployment.
 
-    Parameters
-    ----------
-    keyring
-        Seals with its first key, opens with all of them.
-    tenant_bound
-        True for the deployment's own key: one tenant's export does not open for another.
+    The deployment's own is `tenant_bound`: one tenant's export does not open for another.
     """
 
     keyring: MasterKeyring
@@ -45,13 +40,7 @@ class ExportKey:
 
     @classmethod
     def from_file(cls, path: Path) -> "ExportKey":
-        """Load an operator's key file, in the format of the master key file.
-
-        Raises
-        ------
-        StartError
-            If the file cannot be used.
-        """
+        """Load an operator's key file, in the format of the master key file."""
         try:
             return cls(MasterKeyring.load(path), tenant_bound=False)
         except SealError as error:
@@ -98,15 +87,7 @@ def seal_export(exported: Exported, *, key: ExportKey, contract_id: str, tenant:
 
 
 def open_export(data: bytes, *, key: ExportKey, tenant: str, contract_id: str) -> Exported:
-    """Decrypt an export that a client sent.
-
-    Raises
-    ------
-    InvalidTemplate
-        If it is no export, was altered, or was sealed with another key or for another tenant.
-    ContractMismatch
-        If it belongs to another contract.
-    """
+    """Decrypt an export that a client sent; `InvalidTemplate` where it does not open here."""
     start = len(MAGIC) + CONTRACT_ID_BYTES
     if len(data) < start or not data.startswith(MAGIC):
         raise InvalidTemplate("this is not an export of Veilface")

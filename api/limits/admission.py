@@ -24,15 +24,9 @@ T = TypeVar("T")
 
 
 async def stream_limited(request: Request, limit: int) -> AsyncGenerator[bytes, None]:
-    """Yield the body, and stop as soon as it is known to be larger than ``limit`` bytes.
+    """Yield the body; refuse it as soon as it is known to be larger than ``limit`` bytes.
 
-    Both the declared and the real length count: a chunked body declares none, and a declared one
-    may lie.
-
-    Raises
-    ------
-    ApiError
-        ``request_too_large``.
+    A declared length may lie, and a chunked body declares none: so both lengths count.
     """
     too_large = ApiError(
         "request_too_large",
@@ -40,13 +34,12 @@ async def stream_limited(request: Request, limit: int) -> AsyncGenerator[bytes, 
         {"limit_bytes": limit},
         {"Connection": "close"},
     )
-    declared = request.headers.get("content-length")
-    if declared is not None:
-        if not (declared.isascii() and declared.isdecimal()):
-            raise ApiError("malformed_request", "Content-Length is not a number")
-        # A length of twenty digits is refused without converting it.
-        if len(declared) > 18 or int(declared) > limit:
-            raise too_large
+    declared = request.headers.get("content-length", "0")
+    if not (declared.isascii() and declared.isdecimal()):
+        raise ApiError("malformed_request", "Content-Length is not a number")
+    # A length of twenty digits is refused without converting it.
+    if len(declared) > 18 or int(declared) > limit:
+        raise too_large
     seen = 0
     async for chunk in request.stream():
         seen += len(chunk)
@@ -57,10 +50,7 @@ async def stream_limited(request: Request, limit: int) -> AsyncGenerator[bytes, 
 
 async def read_limited(request: Request, limit: int) -> bytes:
     """Read the whole body into memory, at most ``limit`` bytes of it."""
-    body = bytearray()
-    async for chunk in stream_limited(request, limit):
-        body += chunk
-    return bytes(body)
+    return b"".join([chunk async for chunk in stream_limited(request, limit)])
 
 
 class Gate:
@@ -69,13 +59,8 @@ class Gate:
     One API key has at most half of the places, and half of the threads that compute. So it delays
     another key by no queue, and still uses all processors while it is alone.
 
-    Parameters
-    ----------
-    slots : int
-        Requests of one API key that may compute at the same time; twice as many of all keys.
-    waiting : int
-        Requests that may be inside and not compute: they send their body, or wait for a slot.
-        With the largest body, this bounds the memory for bodies.
+    ``slots`` requests of one key may compute at the same time, twice as many of all keys, and
+    ``waiting`` more may send their body or wait for a slot, which bounds the memory for bodies.
     """
 
     def __init__(self, *, slots: int, waiting: int) -> None:
@@ -89,18 +74,7 @@ class Gate:
 
     @asynccontextmanager
     async def admitted(self, key: str) -> AsyncIterator[None]:
-        """Take a place from before the body is read until the answer is known.
-
-        Parameters
-        ----------
-        key
-            Prefix of the API key.
-
-        Raises
-        ------
-        ApiError
-            ``overloaded``, with ``Retry-After``.
-        """
+        """Take a place for an API key, from before the body is read until the answer is known."""
         if self._taken.total() >= self._places or self._taken[key] >= self._places // 2:
             raise overloaded()
         self._taken[key] += 1
@@ -112,13 +86,7 @@ class Gate:
                 del self._taken[key]
 
     async def compute(self, work: Callable[[], T], *, key: str) -> T:
-        """Run ``work`` in a thread, once there is one for ``key``.
-
-        Parameters
-        ----------
-        key
-            Prefix of the API key; where there is none, what else names who asks.
-        """
+        """Run ``work`` in a thread, once there is one for ``key``, which names who asks."""
         of_key = self._compute_of.setdefault(key, anyio.CapacityLimiter(self._slots))
         try:
             with COMPUTE_WAITING.track_inprogress():
@@ -132,13 +100,8 @@ class Gate:
                 self._compute_of.pop(key, None)
 
     async def query(self, work: Callable[[], T]) -> T:
-        """Run ``work``, which asks the database and computes little, in a thread.
-
-        Raises
-        ------
-        ApiError
-            ``overloaded``: anybody may make a request wait here, with a token of his own making.
-        """
+        """Run ``work``, which asks the database and computes little, in a thread."""
+        # Bounded: anybody may make a request wait here, with a token of their own making.
         if self._asking >= self._queries.total_tokens + MAX_WAITING_QUERIES:
             raise overloaded()
         self._asking += 1

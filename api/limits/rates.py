@@ -33,10 +33,6 @@ RETRY_STORAGE_S = 5.0
 
 CONNECTIONS = 16
 
-CROWD = 10_000
-"""Counters in this process from which on larger networks count as one client. The library looks
-through all counters at a request: 10,000 take a millisecond."""
-
 
 class RateLimits:
     """The limits in force, of one worker.
@@ -47,14 +43,9 @@ class RateLimits:
         Most requests of one API key and of one client address, as ``600/minute``, or ``off``.
     redis_url
         Where workers count together; None to count in this process. It may hold a password, which
-        no message repeats. A server that does not answer is an outage like a later one.
+        no message repeats.
     prefix
         What the names of all keys in Redis begin with.
-
-    Raises
-    ------
-    StartError
-        If the client library of Redis is absent, or the URL is not one of a Redis server.
     """
 
     def __init__(
@@ -65,8 +56,7 @@ class RateLimits:
             for kind, text in (("key", key), ("address", address))
             if text != OFF
         }
-        self._own_counters = MemoryStorage()
-        self._own = SlidingWindowCounterRateLimiter(self._own_counters)
+        self._own = SlidingWindowCounterRateLimiter(MemoryStorage())
         self._redis = None if redis_url is None else _opened(redis_url, prefix)
         self._shared = self._own
         if self._redis is not None:
@@ -76,7 +66,7 @@ class RateLimits:
 
     @classmethod
     def open(cls, settings: Settings) -> "RateLimits":
-        """Make them from the settings; raises as the class does."""
+        """Make them from the settings."""
         url = settings.rate_limit_storage
         return cls(
             key=settings.rate_limit_key,
@@ -85,19 +75,12 @@ class RateLimits:
         )
 
     async def count_address(self, scope: Scope) -> None:
-        """Count a request by its client's address, before anything else is known of it.
-
-        Raises
-        ------
-        ApiError
-            ``rate_limited``, with ``Retry-After``.
-        """
+        """Count a request by its client's address, before anything else is known of it."""
         client = scope.get("client")
-        crowded = len(self._own_counters.storage) >= CROWD
-        await self._count("address", address_of(client[0] if client else "", crowded=crowded))
+        await self._count("address", address_of(client[0] if client else ""))
 
     async def count_key(self, prefix: str) -> None:
-        """Count a request by its API key, or the one that made its token; raises as above."""
+        """Count a request by its API key, or the one that made its token."""
         await self._count("key", prefix)
 
     async def close(self) -> None:
@@ -180,20 +163,18 @@ async def _hit(
     return window.reset_time - time.time()
 
 
-def address_of(host: str, *, crowded: bool = False) -> str:
+def address_of(host: str) -> str:
     """Name what is counted as one client: an IPv4 address, or the /64 network of an IPv6 address.
 
     A provider gives each customer a /64 at least: an attacker would not run out of addresses in
-    it. In a crowd it is a /24 and a /48, of which one customer may have every /64. What is no
-    address, as a proxy may pass it on, is one client, ``unknown``.
+    it. What is no address, as a proxy may pass it on, is one client, ``unknown``.
     """
     try:
         address = ipaddress.ip_address(host)
     except ValueError:
         return "unknown"
-    if isinstance(address, ipaddress.IPv6Address) and address.ipv4_mapped is not None:
-        address = address.ipv4_mapped
     if isinstance(address, ipaddress.IPv6Address):
-        length = 48 if crowded else 64
-        return str(ipaddress.IPv6Network((int(address), length), strict=False))
-    return str(ipaddress.IPv4Network((int(address), 24), strict=False) if crowded else address)
+        if address.ipv4_mapped is None:
+            return str(ipaddress.IPv6Network((int(address), 64), strict=False))
+        address = address.ipv4_mapped
+    return str(address)

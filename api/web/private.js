@@ -221,6 +221,8 @@ async function attempt({ photos, face, ...asked }, send) {
     }
   } catch (error) {
     until.throwIfAborted();
+    // The photos that are chosen next are lifted for the contract in force.
+    if (error.code === "contract_mismatch") prepared = null;
     throw problemOf(error, photos.length);
   }
 }

@@ -4,7 +4,6 @@ import ast
 import importlib.metadata
 import logging
 import re
-import subprocess
 import sys
 import traceback
 from pathlib import Path
@@ -117,42 +116,3 @@ def test_it_imports_httpx_and_pydantic_alone_and_to_lift_the_extra() -> None:
     assert [each for each in stated if "extra" in each] == ["veilface; extra == 'private'"]
     plain = sorted(re.split(r"[<>=]", each)[0] for each in stated if "extra" not in each)
     assert plain == ["httpx", "pydantic"]
-
-
-def needed(*names: str) -> dict[str, importlib.metadata.Distribution]:
-    """The distributions that these need, with all that those need, extras left out."""
-    found: dict[str, importlib.metadata.Distribution] = {}
-    rest = list(names)
-    while rest:
-        name = rest.pop().lower().replace("_", "-")
-        if name in found:
-            continue
-        try:
-            found[name] = importlib.metadata.distribution(name)
-        except importlib.metadata.PackageNotFoundError:
-            continue  # for another platform or Python
-        for each in found[name].requires or []:
-            if "extra ==" not in each:
-                rest.append(re.split(r"[<>=!~;\[ (]", each)[0])
-    return found
-
-
-def test_it_imports_where_nothing_else_is_installed(tmp_path: Path) -> None:
-    closure = needed("httpx", "pydantic")
-    assert {"httpcore", "pydantic-core"} <= closure.keys()
-    for distribution in closure.values():
-        for top in {file.parts[0] for file in distribution.files or [] if file.parts[0] != ".."}:
-            source = Path(str(distribution.locate_file(top)))
-            if source.exists() and not (tmp_path / top).exists() and top != "__pycache__":
-                (tmp_path / top).symlink_to(source)
-    (tmp_path / "veilface_client").symlink_to(PACKAGE)
-    script = (
-        f"import sys; sys.path.append({str(tmp_path)!r}); import veilface_client; "
-        "veilface_client.Client('http://service.test', 'vf_x').close(); "
-        "print(sorted({n.split('.')[0] for n in sys.modules} & "
-        "{'templates', 'models', 'enroll', 'verify', 'api', 'numpy', 'cryptography'}))"
-    )
-    done = subprocess.run(
-        [sys.executable, "-I", "-S", "-c", script], capture_output=True, text=True, cwd=tmp_path
-    )
-    assert (done.returncode, done.stdout, done.stderr) == (0, "[]\n", "")

@@ -3,21 +3,17 @@
 import base64
 import hashlib
 import json
-import sys
 import time
 from collections.abc import Iterator
-from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
-import anyio
 import httpx
 import pytest
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.asymmetric.utils import encode_dss_signature
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
-from starlette.formparsers import MultiPartParser
 
 from tests.examples.conftest import EXAMPLES, PYTHON, Service, clean_environment, running
 from tests.patience import PATIENCE_S
@@ -217,15 +213,6 @@ def test_a_person_is_one_subject_however_the_name_is_typed(
     assert json.loads(decoded(body))["sub"] == "zo\u00eb"
 
 
-def test_too_many_photos_are_told_on_the_page(bridge: httpx.Client) -> None:
-    files = [("images", (f"{number}.jpg", b"x")) for number in range(6)]
-    cookie = begin(bridge)
-    answer = bridge.post("/login", data={"name": "ann"}, files=files, headers={"Cookie": cookie})
-    assert answer.status_code == 400
-    assert "At most five photos." in answer.text
-    assert "<form" in answer.text
-
-
 def test_a_lock_tells_who_can_lift_it(bridge: httpx.Client, service: Service) -> None:
     cookie = begin(bridge)
     with Client(service.url, service.token) as client:
@@ -237,54 +224,6 @@ def test_a_lock_tells_who_can_lift_it(bridge: httpx.Client, service: Service) ->
             client.erase("lou")
     assert answer.status_code == 423
     assert "An administrator can lift the lock." in answer.text
-
-
-def test_a_body_that_is_too_large_is_not_read(bridge: httpx.Client) -> None:
-    assert bridge.post("/login", content=bytes(20_000_001)).status_code == 413
-    assert bridge.post("/token", content=iter([b"x"])).status_code == 413, "in chunks"
-
-
-def test_requests_of_strangers_push_no_login_out(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write_key(tmp_path / "key.pem")
-    clients = json.dumps({"wiki": {"redirect_uri": CALLBACK}})
-    monkeypatch.setenv("ISSUER", "http://bridge")
-    monkeypatch.setenv("CLIENTS", clients)
-    monkeypatch.setenv("SIGNING_KEY", str(tmp_path / "key.pem"))
-    monkeypatch.setattr(MultiPartParser, "spool_max_size", MultiPartParser.spool_max_size)
-    spec = spec_from_file_location("bridge", EXAMPLES / "oidc_bridge" / "bridge.py")
-    assert spec is not None
-    assert spec.loader is not None
-    bridge = module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, "bridge", bridge)
-    spec.loader.exec_module(bridge)
-    monkeypatch.setattr(bridge, "MOST_WAITING", 2)
-
-    async def work() -> list[str]:
-        transport = httpx.ASGITransport(bridge.app)
-        async with httpx.AsyncClient(transport=transport, base_url="http://bridge") as client:
-            first = await client.get("/authorize", params=ASKED)
-            for _ in range(3):
-                await client.get("/authorize", params=ASKED)
-            ours = first.headers["Set-Cookie"].split("; ")[0]
-            told = []
-            for cookie in (ours, "login=guessed"):
-                answer = await client.post("/login", data={"name": "a"}, headers={"Cookie": cookie})
-                told.append(answer.text)
-            return told
-
-    asked_for_a_photo, expired = anyio.run(work)
-    assert "Give a name and a photo." in asked_for_a_photo
-    assert "has expired" in expired
-    assert not bridge.codes
-    assert not bridge.used
-
-
-def test_what_a_cookie_cannot_hold_is_refused(bridge: httpx.Client) -> None:
-    answer = bridge.get("/authorize", params=ASKED | {"state": "s" * 4000})
-    assert answer.status_code == 400
-    assert "Set-Cookie" not in answer.headers
 
 
 def test_a_login_belongs_to_its_browser(bridge: httpx.Client, service: Service) -> None:

@@ -22,7 +22,7 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
-from tests.fuzz.targets import COPIES, Target, target_of
+from tests.fuzz.targets import COPIES, TARGETS, Target
 
 SECONDS = 10.0
 """CPU time of one case; one that takes more hangs. Of a case that waits, six times as much."""
@@ -127,7 +127,7 @@ def caused_by_memory(error: BaseException | None) -> bool:
 
 def cases_of(name: str, folder: Path, *, seed: int, regressions: bool) -> tuple[Target, Any]:
     """Return a target, and the function that makes its n-th case."""
-    target = target_of(name)(folder)
+    target = TARGETS[name](folder)
     if regressions:
         return target, lambda number: target.regressions[number]()
     return target, lambda number: target.make(Random(f"{seed}/{name}/{number}"))

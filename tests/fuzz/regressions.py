@@ -4,7 +4,6 @@ import json
 import struct
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 
 from tests.fuzz.mutations import CAP
 
@@ -52,29 +51,6 @@ def templates() -> Sequence[Callable[[], bytes]]:
     broken = struct.pack("<I", 0x7F800001) + payload[4:]
     text = json.dumps(header, separators=(",", ":")).encode()
     return [lambda: container(text + b" " * (-len(text) % 8), broken)]
-
-
-def pickles() -> Sequence[Callable[[], bytes]]:
-    """Any file: 2 GiB were asked for. Two equal photos, one said often: compared each time."""
-    from tests.fuzz.pickles import Pickles
-
-    def repeated() -> bytes:
-        photo = b"\x89PNG\r\n\x1a\n" + bytes(CAP)
-        one = b"B" + struct.pack("<I", len(photo)) + photo
-        pairs = 100_000
-        bins = b"(" + one + one + b"\x94" + b"h\x00" * (2 * pairs - 2) + b"l"
-        return b"\x80\x04" + bins + b"(" + b"\x88\x89" * (pairs // 2) + b"l\x86."
-
-    return [lambda: Pickles().sound[0], repeated]
-
-
-def contracts(folder: Path) -> Sequence[Callable[[], bytes]]:
-    """Any file: 256 MiB were asked for. Four million values."""
-    from tests.fuzz.contracts import Contracts
-
-    sound = Contracts(folder)
-    wide = b'{"recorded":[' + b"[]," * (4 * CAP) + b"[]]}"
-    return [lambda: sound.sound, lambda: wide]
 
 
 def bodies() -> Sequence[Callable[[], bytes]]:

@@ -1,8 +1,6 @@
 """The readers under test: what each is given, what it may raise, and what it may cost."""
 
 import asyncio
-import contextlib
-import json
 import threading
 from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import dataclass, field
@@ -150,53 +148,6 @@ def export(folder: Path) -> Target:
     return Target(read, (InvalidTemplate, ContractMismatch), Exports().make, 64)
 
 
-def bin_file(folder: Path) -> Target:
-    """``verify.evaluation.readers.insightface_bin``: pickles of strangers."""
-    from tests.fuzz import regressions
-    from tests.fuzz.pickles import Pickles
-    from verify.datasets import DatasetError
-    from verify.evaluation.readers.insightface_bin import read_content
-
-    file = folder / "case.bin"
-
-    def read(data: bytes) -> None:
-        file.write_bytes(data)
-        photos: list[bytes] | None = None
-        same: list[bool] = []
-        # `read_bin` gives a process to it, which may run out of memory.
-        with contextlib.suppress(MemoryError):
-            photos, same, _ = read_content(file)
-        if photos is None:
-            raise DatasetError("too much memory")
-        demand(len(photos) == 2 * len(same), "two photos for each answer")
-        demand(all(type(photo) is bytes for photo in photos), "photos as bytes")
-        demand(all(type(answer) is bool for answer in same), "answers as booleans")
-
-    return Target(read, (DatasetError,), Pickles().make, 256, regressions.pickles())
-
-
-def contract(folder: Path) -> Target:
-    """``templates.contract.document``: the contract file, its JSON and its sealed part."""
-    from templates.contract.document import Binding, Contract
-    from templates.errors import ContractError, SealError
-    from tests.fuzz import regressions
-    from tests.fuzz.contracts import Contracts
-    from tests.fuzz.tensors import SEALER
-
-    file = folder / "case.contract"
-
-    def read(data: bytes) -> None:
-        file.write_bytes(data)
-        loaded = Contract.load(file, SEALER)
-        public = loaded.public()
-        demand(json.loads(json.dumps(public, allow_nan=False)) == public, "plain JSON")
-        demand(Binding.from_json(public["binding"]) == loaded.binding, "a binding as it was read")
-        demand(len(loaded.cohort_seed) == 32, "a seed of 32 bytes")
-
-    made = Contracts(folder)
-    return Target(read, (ContractError, SealError), made.make, 64, regressions.contracts(folder))
-
-
 def decoys(folder: Path) -> Target:
     """``templates.decoys``: generators that anybody may send, and sealed pools."""
     from templates.decoys import load_source
@@ -261,15 +212,6 @@ TARGETS: dict[str, Callable[[Path], Target]] = {
     "template": template,
     "probe": probe,
     "export": export,
-    "bin": bin_file,
-    "contract": contract,
     "decoys": decoys,
     "body": body,
 }
-
-
-def target_of(name: str) -> Callable[[Path], Target]:
-    """The maker of a target, or of one of the faulty ones that the tests use."""
-    from tests.fuzz.faulty import FAULTY
-
-    return TARGETS[name] if name in TARGETS else FAULTY[name]

@@ -105,30 +105,6 @@ def test_the_keyboard_alone_is_enough(open_tab: OpenTab, demo: Served) -> None:
     expect(page.get_by_role("heading", level=1, name="Sign in")).to_be_focused()
 
 
-def test_the_mark_covers_nothing_that_has_the_focus(open_tab: OpenTab, demo: Served) -> None:
-    tab = open_tab(demo)
-    page = tab.page
-    tab.open("Enroll")
-    tab.choose_drawn("person-1", 1)
-    page.set_viewport_size({"width": 360, "height": 300})
-    page.get_by_role("button", name="Enroll", exact=True).focus()
-    for stops in range(40):
-        page.keyboard.press("Shift+Tab")
-        name, top, mark = page.evaluate(
-            """() => {
-              const active = document.activeElement;
-              const mark = document.querySelector(".demo-mark").getBoundingClientRect();
-              const inside = active.closest("main") && !active.classList.contains("unseen");
-              const { top } = active.getBoundingClientRect();
-              return [inside ? active.outerHTML.slice(0, 80) : "", top, mark.bottom];
-            }"""
-        )
-        if not name:
-            assert stops > 5
-            return
-        assert top >= mark, name
-
-
 def press_until(page: Page, selector: str) -> None:
     """Press Tab until an element has the focus; a page has fewer than a hundred stops."""
     for _ in range(100):

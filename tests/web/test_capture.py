@@ -7,10 +7,8 @@ import pytest
 from PIL import Image
 from playwright.sync_api import FilePayload, expect
 
-from tests.web.access import assert_accessible
 from tests.web.answers import DECISION, PendingRequests, refused
 from tests.web.browser_tab import BrowserTab
-from tests.web.camera import FakeCamera
 from tests.web.conftest import OpenTab
 from tests.web.deployments import OTHER, WHO
 from tests.web.served import Served
@@ -148,32 +146,6 @@ def test_a_camera_that_stops_is_said_and_can_be_started_again(
     tab.guided("Guidance is paused: too many requests.")
     page.wait_for_timeout(2500)
     assert asked == ["check"]
-
-
-@pytest.mark.parametrize(
-    ("shown", "dark", "words"),
-    [
-        ((), 1, "No face found"),
-        ((WHO, OTHER), 1, "2 faces found"),
-        ((WHO,), 0.14, "Too dark"),
-        ((WHO,), 1, "Good: one face"),
-    ],
-)
-def test_guidance_says_what_the_camera_shows(
-    open_tab: OpenTab,
-    real: Served,
-    camera: FakeCamera,
-    people: dict[str, list[Path]],
-    shown: tuple[str, ...],
-    dark: float,
-    words: str,
-) -> None:
-    camera.shows(*(people[name][0] for name in shown), dark=dark)
-    tab = open_tab(real, width=360)
-    tab.start_camera()
-    tab.guided(words)
-    assert_accessible(tab, words)
-    expect(tab.page.locator(".found")).to_be_visible(visible=words.startswith("Good"))
 
 
 def jpeg(name: str, data: bytes) -> FilePayload:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Error, Page, expect
+from playwright.sync_api import Error, expect
 
 from tests.api.cli.conftest import run
 from tests.web.answers import DECISION, PendingRequests, refused
@@ -191,22 +191,6 @@ def test_a_refusal_says_what_helps(
     tab.complaints[:] = [each for each in tab.complaints if "status of 503" not in each]
 
 
-def test_a_lock_that_cannot_be_lifted_is_said_once(open_tab: OpenTab, demo: Served) -> None:
-    tab = open_tab(demo)
-    page = tab.page
-    locked, overloaded = refused(423, "locked_out", "x", wait=30), refused(429, "overloaded", "x")
-    page.route("**/verify", lambda route: route.fulfill(**locked))
-    page.route("**/lockout", lambda route: route.fulfill(**overloaded))
-    tab.name_person("person-2")
-    tab.choose_drawn("person-2", 1)
-    tab.press("Verify")
-    for _ in range(2):
-        with page.expect_response("**/lockout"):
-            tab.press("Lift the lock")
-    page.wait_for_timeout(200)
-    expect(page.get_by_role("alert")).to_have_count(2)
-
-
 def test_a_receipt_is_good_for_the_contract_beside_it(
     open_tab: OpenTab, demo: Served, tmp_path: Path
 ) -> None:
@@ -281,54 +265,6 @@ def test_a_late_decision_names_whom_it_is_about(open_tab: OpenTab, demo: Served)
         assert len(pending.routes) == 1
 
 
-def test_a_late_enrollment_is_of_the_photos_that_were_sent(open_tab: OpenTab, demo: Served) -> None:
-    tab = open_tab(demo)
-    page = tab.page
-    tab.open("Enroll")
-    subject = page.get_by_label("Person’s id")
-    third = PendingRequests(page, "**/demo/people/person-1/2.png")
-    enrollment = PendingRequests(page, "**/enrollment")
-
-    def send(name: str) -> tuple[Any, Any]:
-        """Send two photos while a third is on its way; then the field says somebody else."""
-        third.routes.clear()
-        enrollment.routes.clear()
-        tab.name_person(name)
-        page.get_by_role("button", name="Choose photo 3 of person-1").click()
-        late = third.wait()
-        tab.press("Enroll")
-        waiting = enrollment.wait()
-        late.continue_()
-        expect(page.locator(".tray li")).to_have_count(3)
-        tab.good(3)
-        subject.evaluate("(input) => { input.value = 'bob'; input.form.requestSubmit(); }")
-        return waiting, late
-
-    for shot in (1, 2):
-        tab.choose_drawn("person-1", shot)
-    third.routes.clear()
-    waiting, _ = send("alice")
-    # The first photo was sent, the third one was not.
-    waiting.fulfill(**refused(422, "inconsistent_images", "they differ", photos=[0, 2]))
-    expect(page.locator(".tray .seen[data-state=bad]")).to_have_count(1)
-    assert len(enrollment.routes) == 1
-    tab.press("Remove photo from person-1, photo 3")
-    page.get_by_label("Others are in the picture").evaluate("(each) => each.click()")
-    tab.good(2)
-    waiting, _ = send("alice")
-    images = [{"index": index, "status": "used", "quality": {}} for index in range(2)]
-    waiting.fulfill(
-        status=201,
-        json={"template_id": "0" * 32, "contract_id": "0" * 64, "replaced": False,
-              "images": images, "request_id": "0" * 32},
-    )  # fmt: skip
-    expect(page.locator(".verdict")).to_contain_text("Personalice")
-    expect(page.locator(".verdict")).to_contain_text("Photos used2")
-    # It came too late to be sent, and is there still.
-    expect(page.locator(".tray li")).to_have_count(1)
-    expect(page.get_by_label("Remove photo from person-1, photo 3")).to_be_visible()
-
-
 def test_a_late_refusal_of_another_key_does_not_sign_out(open_tab: OpenTab, demo: Served) -> None:
     tab = open_tab(demo)
     page = tab.page
@@ -345,27 +281,3 @@ def test_a_late_refusal_of_another_key_does_not_sign_out(open_tab: OpenTab, demo
         page.wait_for_timeout(200)
     expect(page.get_by_role("button", name="Sign out")).to_be_visible()
     tab.complaints[:] = [each for each in tab.complaints if "ERR_ABORTED" not in each]
-
-
-@pytest.mark.usefixtures("enrolled")
-def test_every_receipt_stays_and_no_failure_is_lost(open_tab: OpenTab, demo: Served) -> None:
-    tab = open_tab(demo)
-    page = tab.page
-    tab.open("People")
-    pending = PendingRequests(page, "**/v1/subjects/*")
-
-    def erase(page: Page, name: str) -> Any:
-        pending.routes.clear()
-        tab.press(f"Erase {name}")
-        page.get_by_role("dialog").get_by_role("button", name="Erase", exact=True).click()
-        return pending.wait()
-
-    for name in NAMES[:2]:
-        claims = {"erased_at": "2026-01-31T12:00:00Z", "erased": [], "subject": "0" * 64,
-                  "signing_key": "0f3a", "receipt_id": name}  # fmt: skip
-        json = {"receipt": {}, "claims": claims, "request_id": "0" * 32}
-        erase(page, name).fulfill(json=json)
-        expect(page.locator(".verdict").first).to_contain_text(f"Erased {name}")
-    expect(page.get_by_role("button", name="Download receipt")).to_have_count(2)
-    erase(page, NAMES[2]).fulfill(**refused(429, "rate_limited", "too many requests"))
-    tab.is_refused("rate_limited")

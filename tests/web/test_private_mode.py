@@ -349,43 +349,6 @@ def test_what_private_mode_cannot_serve_goes_to_the_service_and_that_is_said(
     expect(switch).to_be_enabled()
 
 
-def test_the_enroll_view_promises_no_more_than_private_mode_keeps(
-    served: Served, open_tab: OpenTab
-) -> None:
-    tab = open_tab(served, sign_in=None)
-    steps = tab.page.locator(".empty")
-    photos_leave, none_leaves = "Photos and embedding are forgotten.", "never leave this browser"
-    tab.sign_in(served.token)
-    tab.open("Enroll")
-    expect(steps).to_contain_text(none_leaves)
-    tab.page.get_by_role("switch", name="Private mode").uncheck()
-    expect(steps).to_contain_text(photos_leave)
-    expect(steps).not_to_contain_text(none_leaves)
-
-    def without_templates(route: Route) -> None:
-        answer = route.fetch()
-        route.fulfill(response=answer, json={**answer.json(), "template_enrollment": False})
-
-    tab.page.route("**/v1/contract", without_templates)
-    tab.sign_in(served.token)
-    tab.open("Enroll")
-    expect(tab.page.get_by_text("this tenant may not enroll lifted templates")).to_be_visible()
-    expect(steps).to_contain_text(photos_leave)
-    expect(steps).not_to_contain_text(none_leaves)
-
-
-def test_a_key_without_embeddings_is_told_why(
-    running: Running, served: Served, open_tab: OpenTab
-) -> None:
-    tab = open_tab(served, sign_in=running.deployment.key("verify", "enroll"))
-    switch = tab.page.get_by_role("switch", name="Private mode")
-    for view in ("Verify", "Enroll"):
-        tab.page.get_by_role("link", name=view).first.click()
-        expect(switch).to_be_disabled()
-        expect(tab.page.locator(".private")).to_contain_text("“embeddings”")
-    assert all("/assets/client/ort" not in url for url in tab.requests)
-
-
 def without_the_client(route: Route) -> None:
     answer = route.fetch()
     built = answer.text().replace('data-client="yes"', 'data-client="no"')

@@ -1,4 +1,4 @@
-"""The contract in force, and the decoy generator for clients that lift."""
+"""The contract in force, the decoy generator for clients that lift, and the caller's key."""
 
 from typing import Any
 
@@ -8,13 +8,29 @@ from api.http.answers import has_copy
 from api.http.auth import AnyCall, Lifts
 from api.http.errors import ApiError
 from api.http.receipts import receipt_key_json
-from api.http.schemas import ContractAnswer, ReceiptKey
+from api.http.schemas import ContractAnswer, KeyAnswer, ReceiptKey
 from templates.decoys import DecoyGenerator
+from templates.store.api_keys import Right
 
-router = APIRouter(prefix="/v1/contract", tags=["Operations"])
+router = APIRouter(prefix="/v1", tags=["Operations"])
 
 
-@router.get("", summary="The contract and its security levels")
+@router.get("/key", summary="The API key of this request")
+async def get_own_key(call: AnyCall) -> KeyAnswer:
+    """Right: any. A key is told of itself only, and never its secret nor its label."""
+    return KeyAnswer(
+        **call.common,
+        prefix=call.key.prefix,
+        tenant=call.tenant,
+        rights=[right for right in Right if right in call.key.rights],
+        levels=call.runtime.levels.allowed(lowest_of_key=call.key.lowest_level),
+        liveness=call.runtime.liveness.policy.value,
+        expires_at=call.key.expires_at,
+        demo=call.runtime.settings.demo,
+    )
+
+
+@router.get("/contract", summary="The contract and its security levels")
 async def get_contract(call: AnyCall) -> ContractAnswer:
     """Right: any. What the contract seals is not part of it."""
     runtime = call.runtime
@@ -31,7 +47,7 @@ async def get_contract(call: AnyCall) -> ContractAnswer:
 
 
 @router.get(
-    "/generator",
+    "/contract/generator",
     response_class=Response,
     responses={
         200: {

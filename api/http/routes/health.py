@@ -15,22 +15,14 @@ router = APIRouter(tags=["Operations"])
 
 
 @router.head("/health/live", include_in_schema=False)
-@router.get(
-    "/health/live",
-    response_model=HealthAnswer,
-    summary="The process answers",
-)
+@router.get("/health/live", response_model=HealthAnswer, summary="The process answers")
 async def live(request: Request) -> Response:
     """Right: none. Ask nothing but the process itself."""
     return answer(request, {"status": "ok"})
 
 
 @router.head("/health/ready", include_in_schema=False)
-@router.get(
-    "/health/ready",
-    response_model=HealthAnswer,
-    summary="The worker can answer requests",
-)
+@router.get("/health/ready", response_model=HealthAnswer, summary="The worker can answer requests")
 async def ready(request: Request) -> Response:
     """Right: none. After a failed write the database must take one, a failed model infer once."""
     readiness: Readiness = request.app.state.readiness
@@ -41,13 +33,7 @@ async def ready(request: Request) -> Response:
 async def may_read_metrics(
     request: Request, bearer: BearerDep = None, header: HeaderDep = None
 ) -> None:
-    """Demand a key with the right, unless the setting opens the metrics.
-
-    Raises
-    ------
-    ApiError
-        ``unauthorized``, ``forbidden``, ``rate_limited``, ``overloaded``.
-    """
+    """Demand a key with the right, unless the setting opens the metrics."""
     if not request.app.state.settings.open_metrics:
         (await call_of(request, bearer, header)).require("metrics")
 

@@ -1,11 +1,8 @@
 """The graphs of the pack, for clients that embed: listed, and given by their hashes."""
 
-from pathlib import Path as FilePath
 from typing import Annotated
 
-import anyio
 from fastapi import APIRouter, Depends, Path
-from starlette.requests import ClientDisconnect
 from starlette.responses import FileResponse, Response
 from starlette.types import Receive, Scope, Send
 
@@ -19,19 +16,10 @@ from api.service.served_graphs import licence_of
 router = APIRouter(prefix="/v1/pack", tags=["Tokens"])
 
 KEPT = "private, max-age=31536000, immutable"
-FIRST_S = 30.0
-SLOWEST_BYTES_S = 64 * 1024
-"""How long a download may take: some seconds, and more of them the larger the file is."""
 
 
 async def token_of(call: AnyCall) -> SubjectToken:
-    """Demand a token.
-
-    Raises
-    ------
-    ApiError
-        ``forbidden`` for an API key.
-    """
+    """Demand a token; an API key is ``forbidden``."""
     if call.token is None:
         raise ApiError(
             "forbidden",
@@ -41,27 +29,15 @@ async def token_of(call: AnyCall) -> SubjectToken:
     return call.token
 
 
-class _GraphFile(FileResponse):
-    """The whole of a file, while its time lasts."""
-
-    def __init__(self, path: FilePath, *, headers: dict[str, str], seconds: float) -> None:
-        headers = {**headers, "Accept-Ranges": "none"}
-        super().__init__(path, media_type="application/octet-stream", headers=headers)
-        self._seconds = seconds
+class _WholeFile(FileResponse):
+    """A file without ranges, whose errors would not have the one shape."""
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        whole = {**scope, "headers": [pair for pair in scope["headers"] if pair[0] != b"range"]}
-        with anyio.move_on_after(self._seconds) as time:
-            await super().__call__(whole, receive, send)
-        if time.cancelled_caught:
-            raise ClientDisconnect
+        headers = [pair for pair in scope["headers"] if pair[0] != b"range"]
+        await super().__call__({**scope, "headers": headers}, receive, send)
 
 
-@router.get(
-    "",
-    dependencies=[Depends(token_of)],
-    summary="The graphs that the contract names",
-)
+@router.get("", dependencies=[Depends(token_of)], summary="The graphs that the contract names")
 async def list_pack(call: AnyCall) -> PackAnswer:
     """Right: a token, of any action. Only where the deployment serves its pack (`serve_pack`).
 
@@ -112,7 +88,7 @@ async def get_pack_file(
     """Right: a token, of any action. Only where the deployment serves its pack.
 
     The path names the content, so a copy stays good for ever. Check its SHA-256 before it is run.
-    `Range` is ignored. A client that takes a file more slowly than 64 KiB a second is cut off.
+    `Range` is ignored.
     """
     # Looked up among the few that are served: no part of the path reaches the file system.
     graph = call.runtime.graphs.get(sha256)
@@ -122,7 +98,8 @@ async def get_pack_file(
     if has_copy(call.request, headers["ETag"]):
         return Response(status_code=304, headers=headers)
     graph.require_unchanged()
-    return _GraphFile(graph.path, headers=headers, seconds=FIRST_S + graph.size / SLOWEST_BYTES_S)
+    headers["Accept-Ranges"] = "none"
+    return _WholeFile(graph.path, media_type="application/octet-stream", headers=headers)
 
 
 def _not_served() -> ApiError:

@@ -55,65 +55,51 @@ Check = Callable[[Request], Awaitable[None]]
 
 @dataclass(frozen=True)
 class Served:
-    """One file of the page."""
+    """One file, from memory."""
 
     body: bytes = field(repr=False)
-    media_type: str
-    etag: str
-    encoding: str | None = None
+    suffix: str
+    headers: Mapping[str, str] = field(default_factory=lambda: HEADERS)
 
-    @classmethod
-    def of(cls, body: bytes, suffix: str, encoding: str | None = None) -> "Served":
-        """Name a file by its content."""
-        return cls(body, TYPES[suffix], f'"{hashlib.sha256(body).hexdigest()[:32]}"', encoding)
-
-    def answer(self, request: Request, headers: Mapping[str, str] = HEADERS) -> Response:
+    def answer(self, request: Request) -> Response:
         """Return the file, or that the browser's copy is still the same."""
-        headers = {**headers, "ETag": self.etag}
-        if self.encoding is not None:
-            headers["Content-Encoding"] = self.encoding
-        if has_copy(request, self.etag):
+        headers = {**self.headers, "ETag": f'"{hashlib.sha256(self.body).hexdigest()[:32]}"'}
+        if has_copy(request, headers["ETag"]):
             return Response(status_code=304, headers=headers)
-        return Response(self.body, media_type=self.media_type, headers=headers)
+        return Response(self.body, media_type=TYPES[self.suffix], headers=headers)
 
 
 def page_routes(*, demo: bool, serve_pack: bool) -> list[BaseRoute]:
     """Return the routes of the page."""
     # Not in the demo, whose model knows a cartoon face by a check that no graph holds.
     lifts = serve_pack and not demo
-    client = _built_client(with_runtime=lifts)
+    client = sorted(CLIENT.glob("*.gz" if lifts else "client.js.gz"))
     html = (WEB / "index.html").read_text(encoding="utf-8")
     for name, holds in (("demo", demo), ("client", bool(client)), ("private", lifts)):
         html = html.replace(f'data-{name}="no"', f'data-{name}="{"yes" if holds else "no"}"')
     headers = WITH_GRAPHS if client and lifts else HEADERS
-    assets = client | {
-        path.name: Served.of(path.read_bytes(), path.suffix)
+    assets = {
+        path.name: Served(path.read_bytes(), path.suffix, headers)
         for path in sorted(WEB.iterdir())
         if path.suffix in TYPES and path.name != "index.html"
     }
-    index = Served.of(html.encode(), ".html")
+    for path in client:
+        zipped = {**headers, "Content-Encoding": "gzip"}
+        suffix = Path(path.stem).suffix
+        assets[f"{CLIENT.name}/{path.stem}"] = Served(path.read_bytes(), suffix, zipped)
+    index = Served(html.encode(), ".html", headers)
 
     async def page(request: Request) -> Response:
-        return index.answer(request, headers)
+        return index.answer(request)
 
     async def asset(request: Request) -> Response:
         file = assets.get(request.path_params["name"])
         if file is None:
             raise ApiError("not_found", "there is no such path")
-        return file.answer(request, headers)
+        return file.answer(request)
 
     # A person follows a link to the page, to which mail and search programs add parameters.
     return [route_of("/", page, check=refuse_body), route_of("/assets/{name:path}", asset)]
-
-
-def _built_client(*, with_runtime: bool) -> dict[str, Served]:
-    """Return the client by its names below ``/assets/``; nothing where it was not built."""
-    pattern = "*.gz" if with_runtime else "client.js.gz"
-    named = {path: Path(path.stem) for path in sorted(CLIENT.glob(pattern))}
-    return {
-        f"{CLIENT.name}/{name}": Served.of(path.read_bytes(), name.suffix, "gzip")
-        for path, name in named.items()
-    }
 
 
 def route_of(path: str, endpoint: Endpoint, *, check: Check = refuse_unknown) -> Route:

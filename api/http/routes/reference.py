@@ -37,28 +37,22 @@ POLICY = {
 def reference_routes() -> list[BaseRoute]:
     """Return the routes of the reference."""
     brought = files("fastapi_offline") / "static"
-    served = {
-        "/docs": Served.of(PAGE.encode(), ".html"),
-        "/docs/start.js": Served.of(START.encode(), ".js"),
-    }
-    for name in ("swagger-ui-bundle.js", "swagger-ui.css"):
-        served[f"/docs/{name}"] = Served.of(
-            brought.joinpath(name).read_bytes(), name[name.rindex(".") :]
-        )
-
-    return [_file(path, file, POLICY) for path, file in served.items()]
+    contents = {"/docs": (PAGE.encode(), ".html"), "/docs/start.js": (START.encode(), ".js")}
+    for name, suffix in (("swagger-ui-bundle.js", ".js"), ("swagger-ui.css", ".css")):
+        contents[f"/docs/{name}"] = (brought.joinpath(name).read_bytes(), suffix)
+    return [_file(path, Served(*content, POLICY)) for path, content in contents.items()]
 
 
 def document_routes(document: Mapping[str, Any], *, root_path: str) -> list[BaseRoute]:
     """Return the route of the OpenAPI document; under a path of a proxy, it names that path."""
     if root_path:
         document = {"servers": [{"url": root_path}], **document}
-    file = Served.of(json.dumps(document, separators=(",", ":")).encode(), ".json")
-    return [_file("/v1/openapi.json", file, {"Cache-Control": "no-cache"})]
+    text = json.dumps(document, separators=(",", ":")).encode()
+    return [_file("/v1/openapi.json", Served(text, ".json", {"Cache-Control": "no-cache"}))]
 
 
-def _file(path: str, file: Served, headers: Mapping[str, str]) -> BaseRoute:
+def _file(path: str, file: Served) -> BaseRoute:
     async def serve(request: Request) -> Response:
-        return file.answer(request, headers)
+        return file.answer(request)
 
     return route_of(path, serve)

@@ -1,24 +1,28 @@
-"""Subjects: list, describe, erase."""
+"""Subjects: list, describe, erase; their lockout, for operators' desks."""
 
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Response
 
-from api.http.auth import Enrolls, Erases
+from api.http.auth import Administers, Enrolls, Erases
 from api.http.deps import Cursor, Limit, NoPreconditionDep, SubjectDep, etag
 from api.http.errors import ApiError
 from api.http.receipts import receipt_json
-from api.http.schemas import ReceiptAnswer, Subject, SubjectAnswer, SubjectsAnswer
+from api.http.schemas import (
+    LockoutAnswer,
+    ReceiptAnswer,
+    Subject,
+    SubjectAnswer,
+    SubjectsAnswer,
+    UnlockAnswer,
+)
 from templates.contract.document import Binding
 from templates.store.subject_rows import SubjectRecord
 
 router = APIRouter(prefix="/v1/subjects", tags=["People"])
 
 
-@router.get(
-    "",
-    summary="The tenant's subjects, page by page",
-)
+@router.get("", summary="The tenant's subjects, page by page")
 async def list_subjects(
     call: Enrolls,
     limit: Limit = 100,
@@ -39,10 +43,7 @@ async def list_subjects(
     )
 
 
-@router.get(
-    "/{subject_id}",
-    summary="One subject",
-)
+@router.get("/{subject_id}", summary="One subject")
 async def get_subject(call: Enrolls, subject: SubjectDep, response: Response) -> SubjectAnswer:
     """Right: `enroll`. Metadata only, never template bytes."""
     record = await call.query(lambda: call.store.subjects.describe(call.tenant, subject))
@@ -52,10 +53,7 @@ async def get_subject(call: Enrolls, subject: SubjectDep, response: Response) ->
     return SubjectAnswer(**call.common, **_described(record, call.runtime.contract.binding))
 
 
-@router.delete(
-    "/{subject_id}",
-    summary="Erase a subject",
-)
+@router.delete("/{subject_id}", summary="Erase a subject")
 async def erase_subject(
     call: Erases, subject: SubjectDep, _precondition: NoPreconditionDep
 ) -> ReceiptAnswer:
@@ -82,6 +80,34 @@ async def erase_subject(
         )
 
     return await call.query(work)
+
+
+@router.get("/{subject_id}/lockout", summary="Failed attempts on a subject")
+async def get_lockout(call: Administers, subject: SubjectDep) -> LockoutAnswer:
+    """Right: `admin`. A subject that does not exist is counted like one that does.
+
+    `not_found` where no verification failed since the last accept or reset.
+    """
+    status = await call.query(lambda: call.store.attempts.status(call.tenant, subject))
+    if status is None or (status.consecutive == 0 and status.disabled_at is None):
+        raise ApiError("not_found", "this subject has no failed attempts")
+    return LockoutAnswer(
+        **call.common,
+        consecutive_failures=status.consecutive,
+        last_failed_at=status.last_failed_at,
+        locked_until=status.locked_until,
+        disabled_at=status.disabled_at,
+    )
+
+
+@router.delete("/{subject_id}/lockout", summary="Lift the lockout of a subject")
+async def unlock_subject(call: Administers, subject: SubjectDep) -> UnlockAnswer:
+    """Right: `admin`. Forgets the failed attempts, and enables a subject that was disabled.
+
+    Make sure first that it was the subject who failed: after this, an attacker may try again too.
+    """
+    lifted = await call.query(lambda: call.store.attempts.reset(call.tenant, subject, by=call.by))
+    return UnlockAnswer(**call.common, lifted=lifted)
 
 
 def _described(record: SubjectRecord, binding: Binding) -> dict[str, Any]:

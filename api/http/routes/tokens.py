@@ -65,10 +65,7 @@ async def create_token(call: AnyCall) -> TokenAnswer:
     )
 
 
-@router.get(
-    "/subjects/{subject_id}/tokens/{token_id}",
-    summary="What came of a token",
-)
+@router.get("/subjects/{subject_id}/tokens/{token_id}", summary="What came of a token")
 async def get_token_outcome(
     call: EnrollsOrVerifies,
     subject: SubjectDep,

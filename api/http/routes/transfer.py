@@ -18,10 +18,7 @@ from templates.store.subject_rows import Source
 router = APIRouter(prefix="/v1/subjects", tags=["People"])
 
 
-@router.get(
-    "/{subject_id}/export",
-    summary="Export a subject, encrypted",
-)
+@router.get("/{subject_id}/export", summary="Export a subject, encrypted")
 async def export_subject(call: Exports, subject: SubjectDep) -> ExportAnswer:
     """Right: `export`. The template is un-rotated inside the encryption; a holder's rotation stays.
 

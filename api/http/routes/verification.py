@@ -20,11 +20,11 @@ from fastapi import APIRouter
 
 from api.http.auth import Call, Verifies
 from api.http.bodies import is_form, read_form, read_json, too_many_images
-from api.http.challenges import Challenge, opened_challenge
 from api.http.deps import SubjectDep
 from api.http.errors import ApiError
 from api.http.openapi import body_of
 from api.http.requests import VerifyForm, VerifyJson
+from api.http.routes.challenges import Challenge, opened_challenge
 from api.http.schemas import VerifyAnswer
 from api.service.metrics import count_decision, step
 from api.service.runtime import Runtime
@@ -78,7 +78,9 @@ async def verify(call: Verifies, subject: SubjectDep) -> VerifyAnswer:
             sent = await _sent(call)
         asked = sent.level if token is None else token.level_of(sent.level)
         level = runtime.levels.in_force(asked, lowest_of_key=call.key.lowest_level)
-        challenge = _challenge(call, subject, sent.challenge_id)
+        challenge = None
+        if sent.challenge_id is not None:
+            challenge = opened_challenge(call, sent.challenge_id, subject)
 
         def work() -> Decision:
             try:
@@ -91,13 +93,7 @@ async def verify(call: Verifies, subject: SubjectDep) -> VerifyAnswer:
 
 
 def answer_of(call: Call, decision: Decision, *, probe: str) -> VerifyAnswer:
-    """Return the answer, with what the caller may see; note it for the log and the metrics.
-
-    Parameters
-    ----------
-    probe
-        What metrics call the probe.
-    """
+    """Return the answer, with what the caller may see; note it for the log and the metrics."""
     answer = VerifyAnswer(
         **call.common,
         decision="accept" if decision.accepted else "reject",
@@ -144,18 +140,6 @@ async def _sent(call: Call) -> VerifyForm | VerifyJson:
         )
     runtime.liveness.require(photos=True, challenge=answers)
     return form
-
-
-def _challenge(call: Call, subject: str, challenge_id: str | None) -> Challenge | None:
-    if challenge_id is None:
-        return None
-    return opened_challenge(
-        call.runtime.keyring,
-        challenge_id,
-        tenant=call.tenant,
-        subject=subject,
-        token=call.token,
-    )
 
 
 def _decide(

@@ -1,6 +1,5 @@
 """POST /v1/compare: two photos, decided as a verification, and nothing left of either."""
 
-import itertools
 import sqlite3
 from pathlib import Path
 from typing import Any
@@ -9,13 +8,11 @@ import pytest
 
 from api.http.app import create_app
 from api.http.schemas import VerifyAnswer
-from api.service.opening import file_sealer, open_keyring
 from api.settings import LivenessPolicy
 from tests.api.calls import ask
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, deploy, images, photo
 from tests.api.living import PASSED, calibrated, failed, liveness
-from tests.api.real_people import calibrated_on_lfw
 from tests.api.shapes import assert_answer, assert_error
 from tests.heads import POSES, head
 from tests.marked_heads import draw, encoded
@@ -150,30 +147,3 @@ def test_the_liveness_policy_holds_for_the_second_photo(tmp_path: Path, policy: 
             return
         assert liveness(compare(client, dark, live)) == PASSED
         assert liveness(compare(client, live, dark)) == failed("passive")
-
-
-@pytest.mark.long
-def test_real_people(
-    tmp_path: Path, mbf_pack_dir: Path, lfw_photos: Path, lfw_aligned: Path
-) -> None:
-    """Twelve people of LFW: pairs of one person and pairs of two."""
-    deployment = deploy(tmp_path, pack=mbf_pack_dir)
-    settings = deployment.settings
-    folders = sorted(lfw_photos.iterdir())
-    contract = calibrated_on_lfw(
-        settings, mbf_pack_dir, lfw_aligned, without={folder.name for folder in folders},
-        decoy_faces=150, people=40, m=8, targets=(1e-2,),
-    )  # fmt: skip
-    contract.save(settings.resolved_contract_file, file_sealer(open_keyring(settings)))
-    decisions: dict[bool, list[str]] = {True: [], False: []}
-    with Client(create_app(settings), headers=bearer(deployment.token)) as client:
-        for mine, other in itertools.pairwise(folders[:13]):
-            first, second = sorted(mine.glob("*.jpg"))[:2]
-            stranger = min(other.glob("*.jpg"))
-            for genuine, pair in ((True, (first, second)), (False, (first, stranger))):
-                answer = compare(client, *(path.read_bytes() for path in pair), face="largest")
-                if answer.status_code == 200:
-                    decisions[genuine].append(answer.json()["decision"])
-    assert min(map(len, decisions.values())) >= 8
-    assert decisions[True].count("reject") <= 2
-    assert decisions[False].count("accept") <= 1

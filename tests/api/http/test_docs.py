@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 from fastapi import FastAPI
-from fastapi.routing import APIRoute
 
 from api.http.app import create_app
 from api.http.errors import ERROR_CODES
@@ -74,7 +73,7 @@ def codes_table() -> str:
     """Write the table of error codes of ``docs/rest.md`` from the one table of codes."""
     rows = ["| status | code | meaning |", "|---|---|---|"]
     rows += [
-        f"| {entry.status} | `{entry.code}` | {entry.meaning} |" for entry in ERROR_CODES.values()
+        f"| {entry.status} | `{code}` | {entry.meaning} |" for code, entry in ERROR_CODES.items()
     ]
     return "\n".join(rows) + "\n"
 
@@ -143,13 +142,6 @@ def test_the_document_is_served_and_is_json(client: Client) -> None:
     answer = client.get("/v1/openapi.json", headers={"Authorization": ""})
     assert answer.status_code == 200
     assert json.loads(answer.text)["info"]["title"] == "Veilface"
-
-
-def test_every_route_is_documented() -> None:
-    app = create_app(Settings())
-    for route in app.routes:
-        if isinstance(route, APIRoute):
-            assert route.include_in_schema, route.path
 
 
 def test_the_document_is_there_before_a_request_asks_for_it(

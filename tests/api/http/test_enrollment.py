@@ -136,19 +136,6 @@ def test_broken_templates_are_refused(client: Client, deployment: Deployment) ->
     assert "template" in assert_error(extra, 422, "validation_failed")["known"]
 
 
-@pytest.mark.usefixtures("allowed")
-def test_a_template_needs_the_right_to_send_embeddings(
-    client: Client, deployment: Deployment
-) -> None:
-    token = deployment.key("enroll")
-    answer = client.put(
-        path("x"), json={"template": b64(lifted(deployment))}, headers=bearer(token)
-    )
-    assert assert_error(answer, 403, "forbidden") == {"missing": ["embeddings"]}
-    photos = client.put(path("by-photo"), files=images(photo(3)), headers=bearer(token))
-    assert photos.status_code == 201
-
-
 def test_fields_are_checked(client: Client) -> None:
     cases = [
         {"files": images(photo(1), name="image")},

@@ -198,25 +198,6 @@ def test_malformed_keys_are_refused_and_not_repeated(
             assert len(str(key)) < 20 or str(key)[:20] not in answer.text
 
 
-def test_renewed_rotations_and_master_keys_need_the_same_key(
-    both: tuple[Client, Deployment],
-) -> None:
-    client, deployment = both
-    enroll(client, "stays")
-    runtime: Runtime = client.app.state.runtime
-    rerotation = runtime.store.rerotation
-    rerotation.begin("default")
-    assert rerotation.move("default", runtime.contract.binding) == 1
-    rerotation.retire("default")
-    master_key_file = deployment.settings.resolved_master_key_file
-    MasterKeyring.add_current(master_key_file)
-    assert runtime.store.wrapped_keys.rewrap() > 0
-    MasterKeyring.drop_retired(master_key_file, keep=MasterKeyring.load(master_key_file).current)
-    assert decided(client, "stays", KEY) == "accept"
-    for key in (OTHER, None):
-        assert decided(client, "stays", key) == "reject"
-
-
 @pytest.fixture
 def pair(tmp_path: Path) -> Iterator[tuple[Client, Client]]:
     """Two deployments that exchange exports."""

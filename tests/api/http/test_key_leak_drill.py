@@ -260,24 +260,3 @@ def test_the_drill(tmp_path: Path) -> None:
     assert (ran.status, ran.json["intact"]) == (1, False)
     service.close()
     thief.store.close()
-
-
-def test_a_rotation_that_leaked_alone_costs_nobody_an_enrollment(tmp_path: Path) -> None:
-    deployment = deploy(tmp_path)
-    with Client(create_app(deployment.settings)) as client:
-        for subject in PEOPLE:
-            assert enroll(client, subject, deployment.token, 0, 1) == 201
-        store = client.app.state.runtime.store
-        old = TenantRotation(store.tenants.rotation_key("default").key, AXES)
-        before = {name: store.subjects.get("default", name) for name in PEOPLE}
-        done = operator(deployment, "keys", "rotate-tenant")
-        assert (done["moved"], done["enroll_again"], done["rotations_dropped"]) == (2, [], 1)
-        new = TenantRotation(store.tenants.rotation_key("default").key, AXES)
-        for name, stolen in before.items():
-            subspace = wire.decode(stolen.wire).subspace
-            after = wire.decode(store.subjects.get("default", name).wire).subspace
-            assert np.linalg.norm(after.foot - subspace.foot) > 0.1
-            plain = subspace.turned_by(old.of(stolen.template_id).turned_back)
-            turned = plain.turned_by(new.of(stolen.template_id).turned)
-            assert np.allclose(after.foot, turned.foot, atol=2e-3)
-            assert decision(client, name, deployment.token, 7) == "accept"

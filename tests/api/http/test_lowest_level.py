@@ -8,9 +8,7 @@ from typing import Any
 
 import httpx
 import pytest
-from typer.testing import CliRunner
 
-from api.cli.app import app
 from api.http.app import create_app
 from api.http.errors import StartError
 from api.service.opening import file_sealer, open_keyring, open_store
@@ -175,18 +173,3 @@ def test_a_level_that_the_contract_does_not_have_stops_the_start(tmp_path: Path)
     settings = deploy(tmp_path).settings.model_copy(update={"lowest_level": "fmr-1e-9"})
     with pytest.raises(StartError, match=r"setting lowest_level: .* no level fmr-1e-9; it has"):
         Runtime.open(settings)
-
-
-def test_the_command_line_keeps_to_it(strict_service: tuple[Client, Deployment]) -> None:
-    settings = strict_service[1].settings
-    environment = {
-        "VEILFACE_DATA_DIR": str(settings.data_dir),
-        "VEILFACE_PACK": str(settings.pack),
-        "VEILFACE_LOWEST_LEVEL": STRICT,
-    }
-    file = settings.data_dir / "today.png"
-    file.write_bytes(photo(1, 2))
-    run = CliRunner().invoke
-    refused = run(app, ["verify", "a", str(file), "--level", LAX], env=environment)
-    assert (refused.exit_code, "is below" in refused.stderr) == (2, True)
-    assert run(app, ["verify", "a", str(file)], env=environment).exit_code == 0

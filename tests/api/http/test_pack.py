@@ -4,13 +4,10 @@ import hashlib
 from pathlib import Path
 from typing import Any
 
-import anyio
 import pytest
-from starlette.requests import ClientDisconnect
 
 from api.http.app import create_app
 from api.http.errors import StartError
-from api.http.routes.pack import _GraphFile
 from api.http.schemas import PackAnswer
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, deploy
@@ -130,19 +127,3 @@ def test_a_service_without_a_pack_has_none_to_serve(deployment: Deployment) -> N
     settings = deployment.settings.model_copy(update={"serve_pack": True, "pack": None})
     with pytest.raises(StartError, match="serve_pack: there is no pack"):
         Client(create_app(settings)).__enter__()
-
-
-def test_a_download_ends_with_its_time(tmp_path: Path) -> None:
-    file = tmp_path / "graph.onnx"
-    file.write_bytes(bytes(1000))
-    began: list[Any] = []
-    response = _GraphFile(file, headers={}, seconds=0.05)
-
-    async def never(message: Any = None) -> Any:
-        began.append(message)
-        await anyio.sleep_forever()
-
-    scope = {"type": "http", "method": "GET", "headers": []}
-    with pytest.raises(ClientDisconnect):
-        anyio.run(response, scope, never, never)
-    assert began

@@ -155,12 +155,6 @@ def raw(client: Client, path: str) -> int:
     return statuses[0]
 
 
-def test_the_page_takes_no_other_method(client: Client) -> None:
-    answer = client.post("/")
-    assert_error(answer, 405, "method_not_allowed")
-    assert set(answer.headers["allow"].split(", ")) == {"GET", "HEAD"}
-
-
 def _serving_its_pack(folder: Path, **changes: Any) -> Client:
     deployment = deploy(folder, **{"serve_pack": True, **changes})
     return Client(create_app(deployment.settings), headers=bearer(deployment.token))
@@ -229,13 +223,6 @@ def test_the_page_can_be_switched_off(tmp_path: Path) -> None:
         for path in ("/", "/assets/main.js", "/assets/page.css", "/demo/people"):
             assert_error(client.get(path), 404, "not_found")
         assert client.get("/v1/key").status_code == 200
-
-
-def test_the_calls_keep_their_headers(client: Client) -> None:
-    answer = client.get("/v1/contract")
-    assert answer.headers["cache-control"] == "no-store"
-    assert answer.headers["content-security-policy"] == "default-src 'none'; frame-ancestors 'none'"
-    assert "permissions-policy" not in answer.headers
 
 
 def test_the_page_is_no_part_of_the_contract() -> None:

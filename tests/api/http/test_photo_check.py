@@ -101,14 +101,6 @@ def test_what_is_no_photo_is_an_error_as_elsewhere(
     assert_error(client.post(PATH, headers=headers, **request_of), status, code)
 
 
-def test_a_service_without_a_pack_says_so(tmp_path: Path) -> None:
-    deployment = deploy(tmp_path)
-    settings = deployment.settings.model_copy(update={"pack": None})
-    with Client(create_app(settings), headers=bearer(deployment.token)) as client:
-        answer = client.post(PATH, files=images(photo(1), name="image"))
-        assert_error(answer, 503, "model_unavailable")
-
-
 def test_a_real_face_has_its_box(tmp_path: Path, yunet_pack_dir: Path, lfw_photos: Path) -> None:
     deployment = deploy(tmp_path, pack=yunet_pack_dir)
     face = (lfw_photos / "Ashanti" / "Ashanti_0001.jpg").read_bytes()

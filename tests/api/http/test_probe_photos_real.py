@@ -5,17 +5,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
 from api.http.app import create_app
 from api.http.schemas import VerifyAnswer
 from api.service.opening import file_sealer, open_keyring
-from models.decoding import decode_image
 from models.errors import FaceError
 from models.pack import ModelPack
-from models.synthetic import encode_photo
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, deploy, images
 from tests.api.real_people import calibrated_on_lfw
@@ -134,35 +131,3 @@ def test_a_stranger_in_a_burst_is_named(
             assert 1 in assert_error(answer, 422, "inconsistent_images")["photos"]
             errors.append(answer.json()["error"])
         assert errors[0] == errors[1]
-
-
-def test_advice_depends_on_the_photo_alone(
-    service: tuple[Client, Deployment], people: list[list[bytes]]
-) -> None:
-    """A masked stranger is told to uncover the face, whether the subject is enrolled or not."""
-    client, deployment = service
-    token = bearer(deployment.key("verify"))
-    photos = [people[number][2] for number in range(PEOPLE)]
-    masked = [mask(client.app.state.runtime.pack, photo) for photo in photos]
-    advised = dict.fromkeys(("masked", "bare"), 0)
-    for kind, sent in (("masked", masked), ("bare", photos)):
-        for number, photo in enumerate(sent):
-            other = str((number + 1) % PEOPLE)
-            answers = [verify(client, name, photo, headers=token).json() for name in (other, "no")]
-            if {answer["decision"] for answer in answers} == {"reject"}:
-                assert len({answer.get("advice") for answer in answers}) == 1
-                advised[kind] += "advice" in answers[0]
-    assert advised["masked"] > advised["bare"], advised
-    assert advised["bare"] <= 1
-
-
-def mask(pack: ModelPack, photo: bytes) -> bytes:
-    """Draw a mask over nose, mouth and chin."""
-    image = decode_image(photo)
-    left, right, _, *corners = pack.detect(image)[0].keypoints.astype(float)
-    eyes, across = (left + right) / 2, right - left
-    down = np.mean(corners, axis=0) - eyes
-    places = ((0.45, -0.85), (0.45, 0.85), (1.55, 0.65), (1.85, 0.0), (1.55, -0.65))
-    outline = [eyes + y * down + x * across for y, x in places]
-    cv2.fillPoly(image, [np.round(outline).astype(np.int32)], (90, 140, 190))
-    return encode_photo(image)

@@ -3,11 +3,10 @@
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from urllib.parse import urljoin, urlsplit
+from urllib.parse import urljoin
 
 import httpx
 import pytest
-from playwright.sync_api import expect, sync_playwright
 
 from api.http.app import create_app
 from tests.api.client import Client
@@ -17,7 +16,6 @@ from tests.api.shapes import assert_error
 from tests.patience import PATIENCE_S
 from tests.ports import free_port
 from tests.reliability.proxy import PAGE, require_nginx, running_nginx
-from tests.web.browser_tab import BrowserTab
 from tests.web.conftest import chromium
 from veilface_client import Client as ServiceClient
 
@@ -100,24 +98,3 @@ def test_behind_a_real_proxy_everything_leads_somewhere(
     with ServiceClient(proxied, deployment.token, verify=False) as client:
         client.enroll("anna", [photo(1), photo(1, 1)])
         assert client.verify("anna", photo(1, 2))
-
-
-@pytest.mark.long
-def test_a_browser_signs_in_and_runs_a_call_under_the_path(
-    proxied: str, deployment: Deployment, chromium: Path
-) -> None:
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=chromium)
-        tab = BrowserTab.of(browser.new_context(ignore_https_errors=True), proxied)
-        tab.sign_in(deployment.token)
-        tab.assert_clean()
-        tab.page.goto(urljoin(proxied, "docs"))
-        tab.page.locator("#operations-Operations-getOwnKey").click()
-        tab.page.get_by_role("button", name="Try it out").click()
-        with tab.page.expect_response(lambda answer: "/v1/key" in answer.url) as answered:
-            tab.page.get_by_role("button", name="Execute").click()
-        # Without a key, by the service itself.
-        assert answered.value.json()["error"]["code"] == "unauthorized"
-        expect(tab.page.locator(".live-responses-table").first).to_contain_text("unauthorized")
-        assert {urlsplit(url).path.split("/")[1] for url in tab.requests} == {PREFIX[1:]}
-        browser.close()

@@ -11,8 +11,8 @@ import httpx
 import pytest
 
 from api.http.app import create_app
-from api.http.challenges import LIFETIME_S
 from api.http.requests import LONGEST_S
+from api.http.routes.challenges import LIFETIME_S
 from api.http.schemas import (
     ContractAnswer,
     EnrollmentAnswer,
@@ -25,7 +25,7 @@ from api.service.opening import open_keyring, open_store
 from templates.keys.holder_key import decode_holder_key
 from templates.store.audit_archive import TOKENS_LAST
 from templates.store.lockout import Replayed
-from tests.api.calls import b64, lifted, probe
+from tests.api.calls import b64, probe
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, images, photo
 from tests.api.shapes import assert_answer, assert_error
@@ -295,28 +295,6 @@ def test_a_token_is_good_for_one_embedding_or_template(shared: Service) -> None:
         path = "/v1/subjects/alice/verify"
         assert client.post(path, json=sent, headers=headers).json()["decision"] == "accept"
         assert_error(client.post(path, json=sent, headers=headers), 401, "replayed")
-
-
-def test_embeddings_and_templates_need_the_right_of_the_key(service: Service) -> None:
-    client, deployment = service
-    numbers = client.app.state.runtime.pack.embed_photo(photo(1, 5)).embedding
-    photos_only = issue(client, headers=bearer(deployment.key("verify")))["token"]
-    sent = {"embedding": [float(number) for number in numbers]}
-    refused = client.post("/v1/subjects/alice/verify", json=sent, headers=bearer(photos_only))
-    assert assert_error(refused, 403, "forbidden") == {"missing": ["embeddings"]}
-    template = {"template": b64(lifted(deployment))}
-    path = "/v1/subjects/carol/enrollment"
-    allowed = deployment.key("enroll", "embeddings")
-    for key, details in (
-        (deployment.key("enroll"), {"missing": ["embeddings"]}),
-        (allowed, {"tenant_setting": "template_enrollment"}),
-    ):
-        token = issue(client, "enroll", "carol", headers=bearer(key))["token"]
-        refused = client.put(path, json=template, headers=bearer(token))
-        assert assert_error(refused, 403, "forbidden") == details
-    deployment.allow_templates()
-    assert client.put(path, json=template, headers=bearer(token)).status_code == 201
-    assert_error(client.put(path, json=template, headers=bearer(token)), 401, "replayed")
 
 
 def test_a_theft_of_an_answered_request_gives_nothing(service: Service) -> None:

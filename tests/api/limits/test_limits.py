@@ -1,10 +1,8 @@
-import json
 import tempfile
 import threading
 from collections import Counter
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack
-from typing import Any
 
 import anyio
 import anyio.from_thread
@@ -238,31 +236,6 @@ def test_the_queue_for_the_database_has_an_end(monkeypatch: pytest.MonkeyPatch) 
     with anyio.from_thread.start_blocking_portal() as portal:
         portal.start_task_soon(scenario).result(timeout=PATIENCE_S)
     assert Counter(outcomes) == {"overloaded, retry after 1": 3, "answered": 8}
-
-
-@pytest.mark.parametrize(("size", "apart"), [(60_000, False), (70_000, True)])
-def test_large_json_is_parsed_in_a_thread(
-    monkeypatch: pytest.MonkeyPatch, size: int, apart: bool
-) -> None:
-    parsed_by: list[int] = []
-    parse = json.loads
-
-    def loads(text: str, **options: Any) -> Any:
-        parsed_by.append(threading.get_ident())
-        return parse(text, **options)
-
-    monkeypatch.setattr("api.http.bodies.json.loads", loads)
-    body = b'{"template": "' + b"A" * size + b'"}'
-
-    async def receive() -> dict[str, Any]:
-        return {"type": "http.request", "body": body, "more_body": False}
-
-    async def read() -> Any:
-        request = Request({"type": "http", "headers": JSON}, receive)
-        return await read_json(request, EnrollmentJson)
-
-    assert anyio.run(read).template == bytes(3 * size // 4)
-    assert [thread != threading.get_ident() for thread in parsed_by] == [apart]
 
 
 def test_overload_is_an_answer(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:

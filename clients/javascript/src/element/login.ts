@@ -180,17 +180,12 @@ export class VeilfaceLogin extends Base {
     this.#enter("busy", this.words.hold);
     const photos = await this.#burst(signal);
     this.#enter("busy", this.words.working);
-    const lift = await this.#lifted(photos, signal);
     try {
-      return await this.#send(lift, signal);
+      return await this.#send(await this.#lifted(photos, signal), signal);
     } catch (error) {
-      if (!(error instanceof VeilfaceError) || error.code !== "contract_mismatch") throw error;
-      signal.throwIfAborted();
-      await this.#forgetClient();
-      const again = await this.#lifted(photos, signal);
-      // Else it is the person's stored template that is of another contract.
-      if (again.contractId === lift.contractId) throw error;
-      return this.#send(again, signal);
+      // The next attempt is of the contract in force.
+      if (error instanceof VeilfaceError && error.code === "contract_mismatch") await this.#forgetClient();
+      throw error;
     }
   }
 

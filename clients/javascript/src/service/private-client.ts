@@ -52,10 +52,9 @@ export class Lift {
   }
 }
 
-/** What one contract lifts with. It is freed once it was retired and no lift uses it any more. */
-export class Lifter {
-  #uses = 0;
-  #isRetired = false;
+/** What one contract lifts with. Its lifts run one after the other, and it is freed after the last. */
+class Lifter {
+  #last: Promise<unknown> = Promise.resolve();
 
   constructor(
     readonly contract: PublicContract,
@@ -63,28 +62,14 @@ export class Lifter {
     readonly pack: ModelPack,
   ) {}
 
-  get isRetired(): boolean {
-    return this.#isRetired;
+  use<T>(work: (lifter: Lifter) => Promise<T>): Promise<T> {
+    const result = this.#last.then(() => work(this));
+    this.#last = result.catch(() => undefined);
+    return result;
   }
 
-  async use<T>(work: (lifter: Lifter) => Promise<T>): Promise<T> {
-    this.#uses++;
-    try {
-      return await work(this);
-    } finally {
-      this.#uses--;
-      await this.#freeIfUnused();
-    }
-  }
-
-  async retire(): Promise<void> {
-    if (this.#isRetired) return;
-    this.#isRetired = true;
-    await this.#freeIfUnused();
-  }
-
-  async #freeIfUnused(): Promise<void> {
-    if (this.#isRetired && this.#uses === 0) await this.pack.release();
+  free(): Promise<void> {
+    return this.use(({ pack }) => pack.release());
   }
 }
 
@@ -176,62 +161,48 @@ export class PrivateClient extends Session {
   async close(): Promise<void> {
     if (this.#isClosed) return;
     this.#isClosed = true;
-    if (--this.#shared.clients === 0) await this.#retire();
+    if (--this.#shared.clients === 0) await this.#forget();
   }
 
   #requireOpen(): void {
     if (this.#isClosed) throw new Error("this client was closed: make another one");
   }
 
-  /** Send a lift, or what is lifted now; once more where its contract is no longer in force. */
+  /** Send a lift, or what is lifted now; an error has the lift, to repeat the call with. */
   async #send<T>(lifting: Lift | (() => Promise<Lift>), send: (template: string) => Promise<T>): Promise<T> {
-    let lift = lifting instanceof Lift ? lifting : await lifting();
-    for (let mayRepeat = !(lifting instanceof Lift); ; mayRepeat = false) {
-      try {
-        return await send(base64(lift.template));
-      } catch (error) {
-        if (!(error instanceof VeilfaceError)) throw error;
-        if (error.code !== "contract_mismatch") {
-          error.lift = lift;
-          throw error;
-        }
-        // The stored template may be the one of another contract: then lifting anew is no help.
-        if (!mayRepeat || !(await this.#isOutdated(lift))) throw error;
-        lift = await (lifting as () => Promise<Lift>)();
-      }
+    const lift = lifting instanceof Lift ? lifting : await lifting();
+    try {
+      return await send(base64(lift.template));
+    } catch (error) {
+      if (!(error instanceof VeilfaceError)) throw error;
+      // Not lifted again here: a service that only claims to have changed would get two lifts.
+      if (error.code === "contract_mismatch") await this.#forget();
+      else error.lift = lift;
+      throw error;
     }
   }
 
-  /** Whether another contract is in force than a lift's; then the next one is under that. */
-  async #isOutdated({ contractId }: Lift): Promise<boolean> {
-    const known = await this.#shared.lifter?.catch(() => undefined);
-    if (known?.contract.contract_id === contractId) await this.#retire();
-    return this.#with(async ({ contract }) => contract.contract_id !== contractId);
-  }
-
-  async #retire(): Promise<void> {
+  /** Have the next lift fetch the contract in force. */
+  async #forget(): Promise<void> {
     const { lifter } = this.#shared;
     this.#shared.lifter = undefined;
     // A preparation that failed holds nothing, and its error is that of its caller.
-    await (await lifter?.catch(() => undefined))?.retire();
+    await (await lifter?.catch(() => undefined))?.free();
   }
 
   async #with<T>(work: (lifter: Lifter) => Promise<T>): Promise<T> {
-    for (;;) {
-      this.#requireOpen();
-      const fetching = (this.#shared.lifter ??= this.#fetched());
-      try {
-        const lifter = await fetching;
-        // Another client may have met a newer contract meanwhile.
-        if (!lifter.isRetired) return await lifter.use(work);
-      } catch (error) {
-        // What failed to come is fetched again by the next lift.
-        if (this.#shared.lifter === fetching) {
-          await fetching.catch(() => (this.#shared.lifter = undefined));
-        }
-        throw error;
-      }
+    this.#requireOpen();
+    const fetching = (this.#shared.lifter ??= this.#fetched());
+    let lifter: Lifter;
+    try {
+      lifter = await fetching;
+    } catch (error) {
+      // What failed to come is fetched again by the next lift.
+      if (this.#shared.lifter === fetching) this.#shared.lifter = undefined;
+      throw error;
     }
+    this.#requireOpen();
+    return lifter.use(work);
   }
 
   async #fetched(): Promise<Lifter> {

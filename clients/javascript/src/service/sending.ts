@@ -7,19 +7,15 @@ const VISIBLE = /^[\x21-\x7e]+$/;
 // Connections that were never made, as Node names them; a browser does not tell.
 const NEVER_MADE = new Set(["ECONNREFUSED", "ENOTFOUND", "EAI_AGAIN", "UND_ERR_CONNECT_TIMEOUT"]);
 
-/** How often a call is sent, and how patiently; times in seconds. */
+/** How often a call is sent, and how patiently. */
 export interface Retries {
   /** The most times that one call is sent; 1 never sends again. */
   readonly sendings: number;
-  /** Without `Retry-After` the wait is uniform in 0 to `first`, doubled with each sending … */
-  readonly first: number;
-  /** … up to this. */
-  readonly longest: number;
-  /** A `Retry-After` above this is not waited for: the error is thrown at once. */
+  /** The longest wait, in seconds. A `Retry-After` above it is not waited for: the error is thrown at once. */
   readonly patience: number;
 }
 
-export const DEFAULT_RETRIES: Retries = { sendings: 4, first: 0.25, longest: 8, patience: 30 };
+export const DEFAULT_RETRIES: Retries = { sendings: 4, patience: 30 };
 
 /** How a client connects. */
 export interface ClientOptions {
@@ -170,8 +166,8 @@ export function waitFor(
   if (sending >= retries.sendings || !mayHeal(error, call.onlyOnce ?? false)) return undefined;
   const asked = (error instanceof ServiceError ? error.retryAfter : undefined) ?? 0;
   if (asked > retries.patience) return undefined;
-  const spread = Math.min(retries.longest, retries.first * 2 ** (sending - 1));
-  return asked + Math.random() * spread;
+  // As long as the service says and, with or without it, a random time that doubles.
+  return asked + Math.random() * Math.min(retries.patience, 0.125 * 2 ** sending);
 }
 
 function mayHeal(error: unknown, onlyOnce: boolean): boolean {

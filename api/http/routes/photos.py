@@ -1,30 +1,78 @@
-"""Comparison: do two photos show one person? Nobody is enrolled, and nothing is kept.
-
-The first photo is lifted to a private template in memory, as an enrollment of one photo would be.
-The second is decided against it as a verification, by the same code and the same threshold.
-"""
+"""Photos of nobody who is enrolled: would one do, and do two show one person? Nothing is kept."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 from fastapi import APIRouter
 
-from api.http.auth import Call, Verifies
+from api.http.auth import Call, EnrollsOrVerifies, Verifies
 from api.http.bodies import read_form
+from api.http.errors import plain_details
 from api.http.openapi import body_of
-from api.http.requests import CompareForm
+from api.http.requests import CompareForm, PhotoCheckForm
 from api.http.routes.verification import answer_of
-from api.http.schemas import VerifyAnswer
+from api.http.schemas import PhotoCheckAnswer, VerifyAnswer
 from api.service.metrics import step
-from models.errors import PhotoRejected
+from models.errors import FaceError, PhotoRejected
 from templates.store.audit_log import Entry
 from verify import Decision, probe_of_photos
 
-router = APIRouter(prefix="/v1/compare", tags=["Enroll and verify"])
+router = APIRouter(prefix="/v1", tags=["Enroll and verify"])
 
 
 @router.post(
-    "",
+    "/photos/check",
+    openapi_extra=body_of(form=PhotoCheckForm),
+    summary="Would this photo do?",
+)
+async def check_photo(call: EnrollsOrVerifies) -> PhotoCheckAnswer:
+    """Right: `enroll` or `verify`. For guidance before a camera: finds the face, measures it.
+
+    The same detector and the same limits as enrollment, and no embedding: nothing is compared,
+    and nothing is kept. A photo that would be refused for its face is answered with 200 and
+    `usable` false.
+    """
+    runtime = call.runtime
+    async with call.place():
+        pack = runtime.required_pack()
+        with step("body"):
+            sent = await read_form(call.request, PhotoCheckForm, photos="image", most=1)
+
+        def work() -> PhotoCheckAnswer:
+            limits = runtime.image_limits
+            try:
+                with step("check"):
+                    taken = pack.crop_photo(sent.image[0], policy=sent.face, limits=limits)
+            except FaceError as refusal:
+                code: Any = refusal.code
+                return PhotoCheckAnswer(
+                    **call.common,
+                    usable=False,
+                    code=code,
+                    message=str(refusal),
+                    details=plain_details(refusal.details),
+                    box=None,
+                    quality={},
+                )
+            message = "one face, large and clear enough"
+            if taken.face is None:
+                message = "an aligned crop of a face, clear enough"
+            return PhotoCheckAnswer(
+                **call.common,
+                usable=True,
+                code=None,
+                message=message,
+                details={},
+                box=None if taken.box is None else [round(side, 1) for side in taken.box],
+                quality=taken.quality.as_dict(),
+            )
+
+        return await call.compute(work)
+
+
+@router.post(
+    "/compare",
     openapi_extra=body_of(form=CompareForm),
     summary="Do two photos show one person?",
 )
