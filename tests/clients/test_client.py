@@ -3,10 +3,8 @@
 import asyncio
 import inspect
 import io
-import socket
 from pathlib import Path
 
-import httpx
 import pytest
 
 from tests.api.cli.conftest import run
@@ -15,18 +13,15 @@ from tests.clients.conftest import Running
 from veilface_client import (
     AsyncClient,
     Client,
-    ConnectionFailed,
     EnrollmentConflict,
     Forbidden,
     LockedOut,
     NotEnrolled,
     PhotoRefused,
     PrivateClient,
-    Retries,
     ServiceError,
     Unauthorized,
     Unavailable,
-    UnexpectedAnswer,
     new_holder_key,
 )
 
@@ -260,27 +255,3 @@ def test_both_have_the_same_calls() -> None:
 def test_a_private_client_is_no_client_that_takes_photos() -> None:
     """Neither class inherits from the other: nothing of the photo path can be reached."""
     assert not issubclass(PrivateClient, Client)
-
-
-def test_a_service_that_never_answers() -> None:
-    once = Retries(sendings=1)
-    with (
-        socket.create_server(("127.0.0.1", 0)) as silent,
-        Client(
-            f"http://127.0.0.1:{silent.getsockname()[1]}", "vf_x", timeout=0.2, retries=once
-        ) as client,
-        pytest.raises(ConnectionFailed, match="ReadTimeout") as failed,
-    ):
-        client.contract()
-    assert failed.value.sent
-
-
-def test_a_generator_without_its_name() -> None:
-    def answer(request: httpx.Request) -> httpx.Response:
-        return httpx.Response(200, content=b"generator")
-
-    with (
-        Client("http://x", "vf_x", transport=httpx.MockTransport(answer)) as client,
-        pytest.raises(UnexpectedAnswer, match="X-Decoy-Source-ID"),
-    ):
-        client.generator()

@@ -61,10 +61,6 @@ def test_the_page_of_a_proxy_is_not_repeated(body: object) -> None:
     assert "vf_secret" not in str(error)
 
 
-def test_a_redirection_is_no_answer() -> None:
-    assert isinstance(error_of(answer(302, {})), UnexpectedAnswer)
-
-
 @pytest.mark.parametrize("header", ["Fri, 31 Dec 1999 23:59:59 GMT", "-1", "1e9", "٣", ""])
 def test_a_strange_retry_after_is_none(header: str) -> None:
     error = error_of(

@@ -1,7 +1,6 @@
 """The application in both backends: a password first, then a face, of which a template is sent."""
 
 import base64
-import json
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -219,19 +218,6 @@ def test_an_older_token_replaces_no_face(app: Proxy, people: dict[str, list[Path
     assert owner.accepted
 
 
-def test_a_form_of_another_site_signs_nobody_in(app: Proxy) -> None:
-    """A browser sends it as text, or without a type, and asks nobody before."""
-    assert Visitor(app.url).sign("register", "hal") == 201
-    data = json.dumps({"name": "hal", "password": PASSWORD}).encode()
-    for path in ("login", "register"):
-        for headers in ({"Content-Type": "text/plain"}, {}):
-            visitor = Visitor(app.url)
-            answer = visitor.send("POST", path, content=data, headers=headers)
-            assert answer.status_code in (415, 422)
-            assert visitor.session == ""
-    assert Visitor(app.url).send("POST", "login", content=data, headers=JSON).is_success
-
-
 @pytest.mark.parametrize(
     "path",
     [
@@ -243,24 +229,6 @@ def test_a_form_of_another_site_signs_nobody_in(app: Proxy) -> None:
 def test_nothing_else_is_served(app: Proxy, path: str) -> None:
     url = httpx.URL(app.url).copy_with(raw_path=path.encode())
     assert httpx.get(url).status_code in (404, 405)
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_the_page_may_call_a_service_under_a_path(backend: str, tmp_path: Path) -> None:
-    """By its origin: a path without a slash at its end would let the page call that path alone."""
-    require_client()
-    port = free_port()
-    env = clean_environment(
-        VEILFACE_URL="https://login.example.org/veilface/",
-        VEILFACE_API_KEY="vf_000000000000_" + "0" * 64,
-        PORT=str(port),
-    )
-    url = f"http://127.0.0.1:{port}"
-    with running(command(backend), url, env, tmp_path / "log"):
-        policy = httpx.get(url).headers["Content-Security-Policy"].split("; ")
-        assert "connect-src 'self' https://login.example.org" in policy
-        answer = Visitor(url).send("POST", "register", json={"name": "ann", "password": PASSWORD})
-        assert answer.json()["service"] == "https://login.example.org/veilface"
 
 
 def sign(page: Page, name: str, button: str, password: str = PASSWORD) -> None:

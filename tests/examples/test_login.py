@@ -55,21 +55,6 @@ def test_who_is_let_in(login: str, service: Service) -> None:
         client.reset_lockout("ann")
 
 
-def test_who_is_locked_out_is_told_for_how_long_and_who_can_lift_it(
-    login: str, service: Service
-) -> None:
-    with Client(service.url, service.token) as client:
-        client.enroll("lou", [service.photo(1, number) for number in range(3)])
-        try:
-            while (answer := show(login, "lou", service.photo(2, 0))).status_code == 401:
-                pass
-        finally:
-            client.erase("lou")
-    assert answer.status_code == 423
-    told = r"too many attempts: locked for \d+ s; an administrator can lift it"
-    assert re.fullmatch(told, answer.text)
-
-
 @pytest.mark.parametrize(
     ("name", "photo", "statuses"),
     [

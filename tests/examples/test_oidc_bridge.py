@@ -168,20 +168,6 @@ def test_userinfo_is_for_access_tokens_alone(bridge: httpx.Client, service: Serv
     assert bridge.post("/userinfo", headers=bearer(told["access_token"])).json() == {"sub": "ann"}
 
 
-def test_an_application_may_show_its_secret_in_the_header(
-    bridge: httpx.Client, service: Service
-) -> None:
-    sent = {
-        "grant_type": "authorization_code", "code": code_of(bridge, service),
-        "redirect_uri": CALLBACK, "code_verifier": VERIFIER,
-    }  # fmt: skip
-    for secret in ("wrong", ""):
-        refused = bridge.post("/token", data=sent, auth=("wiki", secret))
-        assert (refused.status_code, refused.json()) == (401, {"error": "invalid_client"})
-    sent["code"] = code_of(bridge, service)
-    assert "id_token" in bridge.post("/token", data=sent, auth=("wiki", "s3cret")).json()
-
-
 def test_another_face_gets_no_code(bridge: httpx.Client, service: Service) -> None:
     cookie = begin(bridge)
     wrong = show(bridge, cookie, "ann", service.photo(2, 0))
@@ -197,33 +183,6 @@ def test_another_face_gets_no_code(bridge: httpx.Client, service: Service) -> No
     assert show(bridge, cookie, "ann", service.photo(1, 4)).status_code == 400, "used up"
     with Client(service.url, service.token) as client:
         client.reset_lockout("ann")
-
-
-@pytest.mark.parametrize("typed", ["zo\u00eb", "zoe\u0308"])
-def test_a_person_is_one_subject_however_the_name_is_typed(
-    bridge: httpx.Client, service: Service, typed: str
-) -> None:
-    with Client(service.url, service.token) as client:
-        client.enroll("zo\u00eb", [service.photo(1, number) for number in range(3)])
-        try:
-            answer = show(bridge, begin(bridge), typed, service.photo(1, 4))
-        finally:
-            client.erase("zo\u00eb")
-    _, body, _ = change(bridge, returned(answer)["code"]).json()["id_token"].split(".")
-    assert json.loads(decoded(body))["sub"] == "zo\u00eb"
-
-
-def test_a_lock_tells_who_can_lift_it(bridge: httpx.Client, service: Service) -> None:
-    cookie = begin(bridge)
-    with Client(service.url, service.token) as client:
-        client.enroll("lou", [service.photo(1, number) for number in range(3)])
-        try:
-            while (answer := show(bridge, cookie, "lou", service.photo(2, 0))).status_code == 401:
-                pass
-        finally:
-            client.erase("lou")
-    assert answer.status_code == 423
-    assert "An administrator can lift the lock." in answer.text
 
 
 def test_a_login_belongs_to_its_browser(bridge: httpx.Client, service: Service) -> None:

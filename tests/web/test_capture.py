@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 from playwright.sync_api import FilePayload, expect
 
-from tests.web.answers import DECISION, PendingRequests, refused
+from tests.web.answers import refused
 from tests.web.browser_tab import BrowserTab
 from tests.web.conftest import OpenTab
 from tests.web.deployments import OTHER, WHO
@@ -98,25 +98,6 @@ def test_nothing_is_sent_once_the_camera_was_left(open_tab: OpenTab, demo: Serve
         assert sent > 0
         page.wait_for_timeout(1300)
         assert checks(tab) == sent
-
-
-def test_a_decision_outlives_the_camera(open_tab: OpenTab, demo: Served) -> None:
-    """The camera goes off while the photos are judged, and once they are."""
-    tab = open_tab(demo)
-    page = tab.page
-    seen = {"usable": True, "code": None, "message": None, "details": {}, "box": None}
-    page.route("**/v1/photos/check", lambda route: route.fulfill(json=seen))
-    pending = PendingRequests(page, "**/verify")
-    tab.start_camera()
-    tab.name_person("person-2")
-    tab.press("Verify")
-    waiting = pending.wait()
-    page.evaluate("dispatchEvent(new Event('pagehide'))")
-    tab.guided("The camera has stopped.")
-    waiting.fulfill(json=DECISION)
-    tab.is_decided("accept")
-    page.get_by_label("Files", exact=True).check()
-    tab.is_decided("accept")
 
 
 def test_a_camera_that_stops_is_said_and_can_be_started_again(

@@ -1,16 +1,15 @@
 """Forms: whom they are about, photos that are dropped, and what comes late."""
 
-import contextlib
 import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Error, expect
+from playwright.sync_api import expect
 
 from tests.api.cli.conftest import run
-from tests.web.answers import DECISION, PendingRequests, refused
+from tests.web.answers import refused
 from tests.web.conftest import OpenTab
 from tests.web.served import Served
 from tests.web.walk import enroll
@@ -78,24 +77,6 @@ def test_people_whose_ids_begin_so_are_suggested(open_tab: OpenTab, demo: Served
     tab.complaints.clear()
 
 
-@pytest.mark.usefixtures("enrolled")
-def test_people_come_page_by_page(open_tab: OpenTab, demo: Served) -> None:
-    tab = open_tab(demo)
-    page = tab.page
-    people = page.locator("li.person")
-    page.route(
-        "**/v1/subjects?*",
-        lambda route: route.continue_(url=route.request.url.replace("limit=100", "limit=2")),
-    )
-    tab.open("People")
-    expect(people).to_have_count(2)
-    expect(page.get_by_text("2 people shown, with more to come.")).to_be_visible()
-    tab.press("Show more")
-    expect(people).to_have_count(4)
-    expect(page.get_by_role("button", name="Show more")).to_be_hidden()
-    expect(people.nth(2).get_by_role("link").first).to_be_focused()
-
-
 def test_an_enrollment_is_replaced_only_where_the_visitor_says_so(
     open_tab: OpenTab, demo: Served
 ) -> None:
@@ -140,31 +121,6 @@ def test_an_enrollment_is_replaced_only_where_the_visitor_says_so(
     assert template_id() != meanwhile
     with demo.client() as client:
         assert client.delete("/v1/subjects/visitor").is_success
-
-
-def test_a_view_that_was_left_asks_nothing_more(open_tab: OpenTab, demo: Served) -> None:
-    """Neither whether to replace an enrollment, nor who has an id."""
-    tab = open_tab(demo)
-    page = tab.page
-    tab.open("Enroll")
-    tab.choose_drawn("person-1", 1)
-    tab.name_person("visitor")
-    pending = PendingRequests(page, "**/enrollment")
-    tab.press("Enroll")
-    waiting = pending.wait()
-    tab.open("People")
-    conflict = refused(409, "enrollment_conflict", "is enrolled", template_id="0" * 32)
-    waiting.fulfill(**conflict)
-    page.wait_for_timeout(300)
-    expect(page.get_by_role("dialog")).to_have_count(0)
-    tab.open("Verify")
-    page.get_by_label("Person’s id").evaluate(
-        "(input) => { input.value = 'left'; input.dispatchEvent(new Event('input'));"
-        " location.hash = '#/service'; }"
-    )
-    expect(page.get_by_role("heading", level=1, name="Service")).to_be_visible()
-    page.wait_for_timeout(400)
-    assert not [url for url in tab.requests if "prefix=left" in url]
 
 
 @pytest.mark.parametrize(
@@ -234,50 +190,3 @@ def test_photos_are_dropped_on_the_form(open_tab: OpenTab, demo: Served) -> None
     tab.open("Enroll")
     page.evaluate(DROP, ["form", url])
     expect(page.locator(".tray li")).to_have_count(0)
-
-
-def test_a_late_decision_names_whom_it_is_about(open_tab: OpenTab, demo: Served) -> None:
-    tab = open_tab(demo)
-    page = tab.page
-    subject = page.get_by_label("Person’s id")
-    pending = PendingRequests(page, "**/verify")
-    for heard in (False, True):
-        pending.routes.clear()
-        subject.fill("alice")
-        tab.choose_drawn("person-2", 1)
-        tab.press("Verify")
-        waiting = pending.wait()
-        expect(subject).to_be_disabled()
-        expect(page.get_by_role("button", name="Remove photo")).to_be_disabled()
-        subject.evaluate(
-            "(input, heard) => { input.value = 'bob'; input.form.requestSubmit();"
-            " if (heard) input.dispatchEvent(new Event('input')); }",
-            heard,
-        )
-        waiting.fulfill(json=DECISION)
-        expect(subject).to_be_enabled()
-        if heard:
-            # Something else is asked by now: the answer is not shown at all.
-            expect(page.locator(".verdict")).to_have_count(0)
-        else:
-            expect(page.locator(".verdict")).to_contain_text("alice, at level fmr-1e-2")
-            expect(page.locator(".verdict")).to_contain_text("0 % (none seen)")
-        assert len(pending.routes) == 1
-
-
-def test_a_late_refusal_of_another_key_does_not_sign_out(open_tab: OpenTab, demo: Served) -> None:
-    tab = open_tab(demo)
-    page = tab.page
-    pending = PendingRequests(page, "**/v1/subjects?*")
-    page.get_by_role("link", name="People").click()
-    waiting = pending.wait()
-    tab.press("Sign out")
-    page.get_by_label("API key").fill(demo.token)
-    tab.press("Sign in")
-    expect(page.get_by_role("button", name="Sign out")).to_be_visible()
-    # It was ended with the key it was made with, so it may be too late to answer it.
-    with contextlib.suppress(Error):
-        waiting.fulfill(**refused(401, "unauthorized", "send a valid API key"))
-        page.wait_for_timeout(200)
-    expect(page.get_by_role("button", name="Sign out")).to_be_visible()
-    tab.complaints[:] = [each for each in tab.complaints if "ERR_ABORTED" not in each]

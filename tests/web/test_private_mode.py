@@ -26,11 +26,6 @@ from tests.web.served import Served
 from tests.web.walk import walk_private
 
 pytestmark = pytest.mark.long
-CHECK_WHAT_FAILS = """async () => {
-  const mode = await import("/assets/private.js");
-  const photo = { get width() { throw new DOMException("too large", "QuotaExceededError"); } };
-  return mode.check(photo, "").catch(({ code }) => code);
-}"""
 HOLD_PICTURES = """() => {
   const { createImageBitmap } = window;
   window.createImageBitmap = async (...given) => {
@@ -254,33 +249,6 @@ def sign_in_again(tab: BrowserTab, served: Served) -> None:
     page.get_by_label("API key").fill(served.token)
     tab.press("Sign in")
     expect(page.get_by_role("navigation", name="Views")).to_be_visible()
-
-
-def test_refusals_have_the_words_of_the_service(
-    served: Served, open_tab: OpenTab, people: dict[str, list[Path]], tmp_path: Path
-) -> None:
-    text = tmp_path / "text.png"
-    text.write_text("no picture")
-    tab = open_tab(served)
-    page = tab.page
-    alert = page.get_by_role("alert")
-    bad = page.locator(".tray .seen[data-state=bad]")
-    tab.open("Enroll")
-    tab.name_person("anna")
-    choose(tab, people[WHO][0], people[OTHER][0])
-    tab.press("Enroll")
-    expect(alert).to_contain_text("Photos 1 and 2 do not look like the same person")
-    expect(alert).to_contain_text("inconsistent_images")
-    expect(bad).to_have_count(2)
-    tab.choose_files(text)
-    expect(bad.last).to_contain_text("not a picture")
-    tab.press("Enroll")
-    expect(alert).to_contain_text("Photo 3 of 3: the file is not a picture")
-    expect(alert).to_contain_text("unsupported_image")
-    expect(alert).to_contain_text("Send a JPEG, PNG or WebP photo.")
-    assert all("/enrollment" not in url for url in tab.requests)
-    # The code of a DOMException is a number, and no code of the service.
-    assert page.evaluate(CHECK_WHAT_FAILS) == "private_mode"
 
 
 def test_what_private_mode_cannot_serve_goes_to_the_service_and_that_is_said(

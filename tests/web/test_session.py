@@ -10,12 +10,6 @@ from tests.web.served import Served
 
 pytestmark = pytest.mark.long
 
-BLOCKED = """
-Object.defineProperty(window, "sessionStorage", {
-  get() { throw new DOMException("blocked", "SecurityError"); },
-});
-"""
-
 
 def test_a_reload_keeps_the_session_unless_that_is_not_wanted(
     open_tab: OpenTab, demo: Served
@@ -91,17 +85,6 @@ def test_what_a_key_may_not_do_is_switched_off_with_the_reason(
     tab.open("Service")
     expect(page.get_by_role("list", name="Rights")).to_contain_text("verify may verify people")
     expect(page.get_by_role("list", name="Rights")).to_contain_text("erase may not erase")
-
-
-def test_a_browser_without_storage_and_a_view_that_is_none(open_tab: OpenTab, demo: Served) -> None:
-    tab = open_tab(demo, sign_in=None)
-    tab.page.add_init_script(BLOCKED)
-    tab.sign_in(demo.token, keep=True)
-    for name in ("constructor", "toString", "__proto__", ""):
-        tab.page.evaluate("name => { location.hash = `#/${name}`; }", name)
-        expect(tab.page.get_by_role("heading", level=1, name="Verify")).to_be_visible()
-    tab.press("Sign out")
-    expect(tab.page.get_by_role("heading", level=1, name="Sign in")).to_be_visible()
 
 
 def test_below_a_prefix_the_page_works_alike(open_tab: OpenTab, demo: Served) -> None:

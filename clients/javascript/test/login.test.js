@@ -167,54 +167,18 @@ test("graphs are fetched while the person looks, and what failed is tried again 
   assert.equal(login.status.value, "Später.");
 });
 
-test("that photos will be sent is said before the camera starts, and a running one stops for it", async () => {
-  const asked = [];
-  const fetch = async (url) => {
-    asked.push(new URL(url).pathname);
-    return new Response("", { status: 503 });
-  };
-  const authorize = async () => ({ subject: "anna", token: `vft_${"a".repeat(20)}` });
-  const { login, tracks } = element({ authorize, fetch });
-  assert.equal(login.notice.textContent, "");
-  login.button.click();
-  await settled();
-  asked.length = 0;
-  login.setAttribute("liveness", "head-movements");
-  assert.match(login.notice.textContent, /Photos .* are sent to the service/);
-  assert.deepEqual([tracks.map(({ stopped }) => stopped), login.button.textContent], [[true], "Start camera"]);
-  login.button.click();
-  await settled();
-  assert.deepEqual([tracks.length, login.button.textContent], [2, "Log in"]);
-  assert.deepEqual(asked, [], "no graph is fetched for it");
-  login.setAttribute("liveness", "off");
-  assert.deepEqual([login.notice.textContent, tracks[1].stopped], ["", true]);
-  login.setAttribute("liveness", "head-movements");
-  login.setAttribute("action", "enroll");
-  assert.equal(login.notice.textContent, "", "an enrollment sends none");
-  assert.equal(login.button.attributes["aria-describedby"], login.notice.id);
-});
-
 test("words that are given late are shown, and those that are not stay in English", () => {
   const { login } = element();
-  login.setAttribute("liveness", "head-movements");
-  login.words = { start: "Kamera an", movements: { front: "Geradeaus." } };
+  login.words = { start: "Kamera an", hints: { blur: "Stillhalten." } };
   assert.equal(login.button.textContent, "Kamera an");
-  assert.match(login.notice.textContent, /Photos .* are sent to the service/);
-  const { front, look_up } = login.words.movements;
-  assert.deepEqual([front, look_up], ["Geradeaus.", "Look up."]);
-  login.words = { frames: "Fotos gehen an den Dienst." };
-  assert.equal(login.notice.textContent, "Fotos gehen an den Dienst.");
+  const { blur, pose } = login.words.hints;
+  assert.deepEqual([blur, pose], ["Stillhalten.", "Look straight into the camera."]);
 });
 
-test("no challenge is answered where nothing says that photos are sent", async () => {
-  let tokens = 0;
-  const { login } = element({ authorize: async () => ({ subject: "anna", token: `vft_${tokens++}` }) });
-  login.setAttribute("liveness", "head-movements");
-  for (const frames of ["", " ", undefined]) {
-    login.words = { frames };
-    await assert.rejects(login.attempt(), /words\.frames/);
-  }
-  assert.equal(tokens, 0);
+test("an element without a runtime says so", async () => {
+  const { login } = element({ authorize: async () => ({ subject: "anna", token: "vft_" }) });
+  login.options = {};
+  await assert.rejects(login.attempt(), /needs the runtime/);
 });
 
 test("an attribute that stays as it is ends nothing, and none starts an element that left", async () => {
@@ -225,7 +189,7 @@ test("an attribute that stays as it is ends nothing, and none starts an element 
   login.setAttribute("action", "enroll");
   assert.deepEqual([tracks[0].stopped, login.button.textContent], [false, "Enroll"]);
   login.leave();
-  login.setAttribute("liveness", "head-movements");
+  login.setAttribute("action", "verify");
   await assert.rejects(login.attempt(), { name: "AbortError" });
 });
 
@@ -271,32 +235,14 @@ test("the camera stays on only where another photo, or the passkey, may help", a
   }
 });
 
-test("who sends frames needs no runtime, and who lifts is told that one is missing", async () => {
-  const { login } = element({ authorize: async () => ({ subject: "anna", token: `vft_${"a".repeat(20)}` }) });
-  const asked = [];
-  login.options = { retries: { sendings: 1 }, fetch: async (url) => {
-    asked.push(new URL(url).pathname);
-    return new Response("", { status: 503 });
-  } };
-  await assert.rejects(login.attempt(), /needs the runtime/);
-  login.setAttribute("liveness", "head-movements");
-  await assert.rejects(login.attempt(), { code: "http_503" });
-  assert.deepEqual(asked, ["/v1/challenges"]);
-  assert.equal(login.status.attributes["aria-live"], "polite");
-});
-
 test("where the service checks liveness, private mode says that it cannot serve", async () => {
   const refusal = { error: { code: "forbidden", message: "liveness is asked for", details: { liveness: "active" } } };
   const fetch = async () => Response.json(refusal, { status: 403 });
   const authorize = async () => ({ subject: "anna", token: `vft_${"a".repeat(20)}` });
   const { login, told } = element({ authorize, fetch });
-  for (const [mode, says] of [["off", /This page sends none/], ["head-movements", /^liveness is asked for$/]]) {
-    told.length = 0;
-    login.setAttribute("liveness", mode);
-    login.button.click();
-    await settled();
-    login.button.click();
-    while (told.length === 0) await settled();
-    assert.match(login.status.value, says);
-  }
+  login.button.click();
+  await settled();
+  login.button.click();
+  while (told.length === 0) await settled();
+  assert.match(login.status.value, /This page sends none/);
 });

@@ -169,15 +169,6 @@ def test_strangers_and_readers_write_nothing(service: tuple[Client, Deployment])
     assert last(client).sequence == before
 
 
-def test_the_chain_of_all_this_is_whole(service: tuple[Client, Deployment]) -> None:
-    client, _ = service
-    for person in (1, 2, 1):
-        client.post("/v1/subjects/alice/verify", files=images(photo(person, 3), name="image"))
-    found = client.app.state.runtime.store.audit_log.verify()
-    assert found.intact
-    assert found.lines >= 4
-
-
 def test_a_decision_that_cannot_be_recorded_is_not_told(
     service: tuple[Client, Deployment], monkeypatch: pytest.MonkeyPatch
 ) -> None:

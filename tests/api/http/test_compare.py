@@ -77,18 +77,6 @@ def test_nothing_is_kept_but_a_line_without_a_subject(tmp_path: Path) -> None:
     ]
 
 
-def test_a_decision_without_its_line_is_not_told(
-    client: Client, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from templates.errors import StoreUnavailable
-
-    def full(*_: object) -> None:
-        raise StoreUnavailable("the database or disk is full")
-
-    monkeypatch.setattr(client.app.state.runtime.store.audit_log, "append", full)
-    assert_error(compare(client, photo(1), photo(1, 1)), 503, "store_unavailable")
-
-
 def test_who_may_ask_and_who_sees_the_distance(client: Client, deployment: Deployment) -> None:
     both = (photo(1), photo(1, 1))
     for rights, seen in (
@@ -125,14 +113,6 @@ def test_what_is_refused(
     client: Client, request_of: dict[str, Any], status: int, code: str, details: dict[str, Any]
 ) -> None:
     assert assert_error(client.post(PATH, **request_of), status, code) == details
-
-
-def test_it_counts_towards_the_rate_of_the_key(tmp_path: Path) -> None:
-    deployment = deploy(tmp_path, rate_limit_key="2/minute")
-    with Client(create_app(deployment.settings), headers=bearer(deployment.token)) as client:
-        for _ in range(2):
-            assert compare(client, photo(1), photo(1, 1)).status_code == 200
-        assert_error(compare(client, photo(1), photo(1, 1)), 429, "rate_limited")
 
 
 @pytest.mark.parametrize("policy", ["passive", "active"])

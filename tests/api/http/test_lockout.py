@@ -176,13 +176,6 @@ def test_a_disabled_subject_waits_for_an_operator(
         assert attempt(client, token, 1).json()["decision"] == "accept"
 
 
-def test_it_can_be_switched_off(tmp_path: Path) -> None:
-    own = deploy(tmp_path, lockout_after=0)
-    with Client(create_app(own.settings), headers=bearer(own.token)) as client:
-        enroll(client)
-        fail(client, own.key("verify"), 4 * AFTER)
-
-
 @pytest.mark.parametrize("scores", [True, False])
 def test_hill_climbing_ends_at_the_lockout(both: tuple[Client, Deployment], scores: bool) -> None:
     """The climber of the audit, over REST: it gets five answers, and none of them is an accept."""

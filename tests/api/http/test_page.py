@@ -120,17 +120,6 @@ def test_what_is_no_file_of_the_page_is_the_contracts_404(client: Client, path: 
     assert "permissions-policy" not in answer.headers
 
 
-@pytest.mark.parametrize(
-    "path",
-    ["/assets/../app.py", "/assets/../../web/main.js", "/assets/..", "/assets//main.js",
-     "/assets/./main.js", "//assets/main.js", "/assets/\x00", "/assets/..\\app.py"],
-)  # fmt: skip
-def test_a_path_that_climbs_finds_nothing(client: Client, path: str) -> None:
-    # HTTP clients resolve the dots before they send: so it is given to the application as it is.
-    assert raw(client, "/assets/main.js") == 200
-    assert raw(client, path) == 404
-
-
 def raw(client: Client, path: str) -> int:
     """Ask for a path that nobody has normalised; return the status."""
     scope = {

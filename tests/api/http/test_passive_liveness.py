@@ -88,19 +88,6 @@ def test_frames_are_held_against_both(passive: Client, both: Client) -> None:
     assert answer.json()["error"]["details"] == {"liveness": "both"}
 
 
-def test_a_liveness_graph_that_nobody_asks_for_stops_nothing(tmp_path: Path) -> None:
-    deployment = calibrated(tmp_path)
-    (tmp_path / "pack" / "light.onnx").rename(tmp_path / "pack" / "4_0_0_80x80_gone.onnx")
-    with Client(create_app(deployment.settings)) as client:
-        client.headers.update(bearer(deployment.token))
-        put = client.put("/v1/subjects/anna/enrollment", files=images(shown()))
-        assert put.status_code == 201, put.text
-        assert verified(client, shown()).json()["decision"] == "accept"
-    asked = deployment.settings.model_copy(update={"liveness": LivenessPolicy.PASSIVE})
-    with pytest.raises(StartError, match=r"light\.onnx"):
-        Runtime.open(asked)
-
-
 def test_a_threshold_of_other_graphs_does_not_start(tmp_path: Path) -> None:
     deployment = calibrated(tmp_path, liveness=LivenessPolicy.PASSIVE)
     pack_file = tmp_path / "pack" / "pack.toml"

@@ -2,18 +2,16 @@
 
 import io
 import sqlite3
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from api.http.app import create_app
 from api.http.schemas import PhotoCheckAnswer
 from models.embedding import Embedder
 from tests.api.client import Client
-from tests.api.deployment import Deployment, bearer, deploy, images, photo
+from tests.api.deployment import Deployment, bearer, images, photo
 from tests.api.shapes import assert_answer, assert_error
 
 PATH = "/v1/photos/check"
@@ -99,30 +97,3 @@ def test_what_is_no_photo_is_an_error_as_elsewhere(
 ) -> None:
     headers = {**client.headers, **request_of.pop("headers", {})}
     assert_error(client.post(PATH, headers=headers, **request_of), status, code)
-
-
-def test_a_real_face_has_its_box(tmp_path: Path, yunet_pack_dir: Path, lfw_photos: Path) -> None:
-    deployment = deploy(tmp_path, pack=yunet_pack_dir)
-    face = (lfw_photos / "Ashanti" / "Ashanti_0001.jpg").read_bytes()
-    two = Image.new("RGB", (500, 250))
-    for left, side, name in ((0, 250, "Ashanti"), (250, 170, "Antonio_Palocci")):
-        photo_of = Image.open(lfw_photos / name / f"{name}_0001.jpg")
-        two.paste(photo_of.resize((side, side)), (left, 0))
-    out = io.BytesIO()
-    two.save(out, "JPEG", quality=95)
-    with Client(create_app(deployment.settings), headers=bearer(deployment.token)) as client:
-
-        def check(data: bytes, **fields: str) -> dict[str, Any]:
-            answer = client.post(PATH, files=images(data, name="image"), data=fields)
-            return assert_answer(answer, 200, PhotoCheckAnswer)
-
-        x1, y1, x2, y2 = check(face)["box"]
-        # LFW's pictures are centred on the face.
-        assert 0 <= x1 < 125 < x2 <= 250
-        assert 0 <= y1 < 125 < y2 <= 250
-        several = check(out.getvalue())
-        assert several["code"] == "multiple_faces"
-        assert several["details"] == {"faces": 2}
-        assert several["box"] is None
-        assert check(out.getvalue(), face="largest")["usable"] is True
-        assert check(grey(120))["code"] == "no_face"

@@ -84,18 +84,6 @@ def test_an_erasure_does_not_pass_over_them(
     assert client.delete("/v1/subjects/ann").status_code == 200
 
 
-def test_a_refusal_is_audited(both: tuple[Client, Deployment]) -> None:
-    client, _ = both
-    for _ in range(2):
-        client.put(
-            path("ann"), files=images(photo(1)), headers=NEVER | {"X-Request-ID": "ann-ann-1"}
-        )
-    lines = list(client.app.state.runtime.store.audit_log.lines())
-    assert [
-        (line.action, line.outcome, line.request_id) for line in lines if line.action == "enroll"
-    ] == [("enroll", "created", "ann-ann-1"), ("enroll", "enrollment_conflict", "ann-ann-1")]
-
-
 def test_of_many_at_once_one_enrolls(both: tuple[Client, Deployment]) -> None:
     client, deployment = both
     deployment.allow_templates()

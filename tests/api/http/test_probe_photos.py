@@ -90,12 +90,6 @@ def test_more_than_five_are_too_many(client: Client, scored: str) -> None:
     assert_error(ask(client, scored, json={"embeddings": rows}), 400, "invalid_embedding")
 
 
-def test_photos_come_under_one_name(client: Client, scored: str) -> None:
-    both = images(BURST[0], name="image") + images(BURST[1], name="images")
-    for files in (both, images(*BURST, name="x")):
-        assert_error(ask(client, scored, files=files), 422, "validation_failed")
-
-
 def test_hostile_embeddings(client: Client, scored: str) -> None:
     good = embedding(client, 1)
     for case in (
@@ -118,12 +112,6 @@ def test_hostile_embeddings(client: Client, scored: str) -> None:
     for other in ({"embedding": good}, {"template": "AAAA"}):
         answer = ask(client, scored, json={"embeddings": [good], **other})
         assert_error(answer, 422, "validation_failed")
-
-
-def test_opposite_embeddings_have_no_mean(client: Client, scored: str) -> None:
-    good = embedding(client, 1)
-    answer = ask(client, scored, json={"embeddings": [good, [-x for x in good]]})
-    assert assert_error(answer, 422, "inconsistent_images") == {"photos": [0, 1]}
 
 
 def test_a_burst_is_one_attempt(both: tuple[Client, Deployment]) -> None:

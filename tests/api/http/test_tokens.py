@@ -271,21 +271,6 @@ def test_a_token_tells_no_distance_and_not_who_is_enrolled(shared: Service) -> N
     assert (unknown["decision"], unknown["reason"]) == ("reject", "no_match")
 
 
-def test_what_came_with_an_error_leaves_the_token(shared: Service) -> None:
-    client, _ = shared
-    token = issue(client)["token"]
-    path = "/v1/subjects/alice/verify"
-    refused = client.post(path, files=images(b"no photo", name="image"), headers=bearer(token))
-    assert_error(refused, 400, "unsupported_image")
-    assert verify(client, token).json()["decision"] == "accept"
-    token = issue(client, "enroll", "dora")["token"]
-    refused = client.put(
-        "/v1/subjects/dora/enrollment", files=images(photo(3), photo(4)), headers=bearer(token)
-    )
-    assert_error(refused, 422, "inconsistent_images")
-    assert enroll(client, token, 3, "dora").status_code == 201
-
-
 def test_a_token_is_good_for_one_embedding_or_template(shared: Service) -> None:
     client, deployment = shared
     numbers = client.app.state.runtime.pack.embed_photo(photo(1, 5)).embedding.tolist()

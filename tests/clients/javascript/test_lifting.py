@@ -1,13 +1,12 @@
 """Lifting in JavaScript: what Python's lifts hold and hide, in bytes that the server reads."""
 
 import base64
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.stats import ks_2samp, kstest
+from scipy.stats import kstest
 
 from templates.contract import wire
 from templates.contract.binding import Binding
@@ -16,7 +15,7 @@ from templates.errors import DecoyError
 from templates.keys.randomness import Keystream
 from templates.keys.rotation import ROTATION_VERSION
 from templates.space.agreement import InconsistentImages, mean_embedding
-from templates.space.lifting import Strategy, lift
+from templates.space.lifting import Strategy
 from templates.space.subspace import SubspaceBatch
 from tests.clients.javascript.conftest import Node
 
@@ -129,43 +128,6 @@ def test_lifts_hold_the_projection(node: Node) -> None:
     cases = [(Strategy.ADVERSARIAL, 8), (Strategy.ADVERSARIAL, 32), (Strategy.HYBRID, 9)]
     cases += [(Strategy.RANDOM, 4), (Strategy.ADVERSARIAL, 1)]
     check_lifts(node, SOURCE, cases, people(1, 64)[0])
-
-
-@pytest.mark.long
-def test_lifts_of_a_real_dimension(node: Node, shared_data: Path) -> None:
-    """Decoys of real faces, with axes and dimensions as recommended contracts have them."""
-    rows = np.load(shared_data / "embeddings" / "lfw_rest.npz")["emb_mbf"].astype(np.float32)
-    source = DecoyGenerator.fit(unit(rows[:3000])).reduced(300)
-    cases = [(Strategy.ADVERSARIAL, m) for m in (4, 32, 128)]
-    check_lifts(node, source, cases, unit(rows[5000:5001])[0])
-
-
-def test_a_lift_s_directions_are_decoys(node: Node) -> None:
-    """m + 1 points span a set of m dimensions: all but the embedding are drawn like decoys.
-
-    The foot points of lifts of one embedding have the length that Python's have.
-    """
-    embedding = people(1, 64)[0]
-    question = {
-        "call": "lift",
-        "embedding": b64(embedding.tobytes()),
-        "generator": b64(SOURCE.to_bytes()),
-        "strategy": "adversarial",
-        "m": 8,
-        "contract_id": CONTRACT_ID,
-    }
-    answers = node("lift.js", [question] * 400)
-    ours = [np.linalg.norm(unb64(answer["value"]["foot"], "<f4")) for answer in answers]
-    stream = Keystream.seeded("lifts")
-    point = SOURCE.project(embedding[None])
-    theirs = lift(
-        np.repeat(point, 4000, axis=0),
-        strategy=Strategy.ADVERSARIAL,
-        m=8,
-        source=SOURCE,
-        stream=stream,
-    )
-    assert ks_2samp(ours, np.linalg.norm(theirs.feet, axis=1)).pvalue > 1e-6
 
 
 BINDING = Binding(

@@ -1,11 +1,10 @@
-/** `<veilface-login>`: camera, burst or head movements, decision, for any page. */
+/** `<veilface-login>`: camera, burst, decision, for any page. */
 
 import type { Decision, Enrollment } from "../answers.js";
 import { isPhotoRefused, PasskeyError, VeilfaceError } from "../errors.js";
 import type { FacePolicy } from "../models/faces.js";
 import { fromImageData, type RgbImage } from "../models/image.js";
 import type { PhotoCheck } from "../models/pack.js";
-import { Client } from "../service/client.js";
 import { createPasskey, passkeyHolderKey, type Passkey } from "../service/passkey.js";
 import { PrivateClient, type Lift, type PrivateOptions } from "../service/private-client.js";
 import { STYLE, type State } from "./look.js";
@@ -22,16 +21,11 @@ export interface Authorization {
   readonly holderKey?: Uint8Array;
 }
 
-/** Of `PrivateClient`; a verification that sends frames needs no runtime. */
-export type LoginOptions = Omit<PrivateOptions, "signal" | "runtime"> &
-  Partial<Pick<PrivateOptions, "runtime">>;
+/** Of `PrivateClient`. */
+export type LoginOptions = Omit<PrivateOptions, "signal">;
 
 const BURST = 3;
 const BETWEEN_FRAMES = 150; // milliseconds, so that the frames are not one picture three times
-// Of a movement, as on the service's own page: two frames on the way out, one back at the front.
-const READY = 2500;
-const OUT = [1200, 600];
-const BACK = 1300;
 const BETWEEN_LOOKS = 600;
 // What went wrong is left to be read before guidance goes on.
 const READING = 5000;
@@ -55,31 +49,26 @@ const Base = globalThis.HTMLElement ?? (class {} as typeof HTMLElement);
  * The attribute `service` is the service's URL, by default the page's own origin; `action` is
  * `verify` (by default) or `enroll`; `face` is a {@link FacePolicy}, by default `dominant`. With the
  * attribute `passkey` an enrollment makes one and is locked to the key that it gives, and a
- * verification asks for it. Parts for styling: `card`, `notice`, `viewfinder`, `video`, `status`, `button`.
- *
- * With `liveness="head-movements"` a verification sends no private template: it answers a challenge, by
- * frames that are sent as photos, and `words.frames` says so. An enrollment stays private.
+ * verification asks for it. Parts for styling: `card`, `viewfinder`, `video`, `status`, `button`.
  *
  * Taken out of the page it stops the camera and ends the attempt: nothing more is sent or told.
  *
  * Never believe the event alone: your server asks the service what came of the token.
  */
 export class VeilfaceLogin extends Base {
-  static readonly observedAttributes = ["liveness", "action"];
+  static readonly observedAttributes = ["action"];
 
   // Declared and not defined: a page may have set them before its element was known.
   /** Of `PrivateClient`: the ONNX Runtime, and where the graphs are. */
   declare options: LoginOptions | undefined;
   /**
    * Asks your server for a token, which is good for one call and for minutes: called once to fetch
-   * the graphs, which may take longer than that, and once for each attempt. Where frames are sent, it is
-   * called once, before the movements.
+   * the graphs, which may take longer than that, and once for each attempt.
    */
   declare authorize: (() => Promise<Authorization>) | undefined;
 
   #words = withDefaults({});
   readonly #card = part("section", "card");
-  readonly #notice = part("p", "notice");
   readonly #video = part("video", "video");
   readonly #status = part("output", "status");
   readonly #button = part("button", "button");
@@ -102,13 +91,11 @@ export class VeilfaceLogin extends Base {
     root.adoptedStyleSheets = [sheet];
     this.#video.muted = true;
     this.#video.playsInline = true;
-    this.#notice.id = "notice";
     this.#button.type = "button";
-    this.#button.setAttribute("aria-describedby", this.#notice.id);
     this.#button.addEventListener("click", () => void this.#clicked());
     const viewfinder = part("div", "viewfinder");
     viewfinder.append(this.#video);
-    this.#card.append(this.#notice, viewfinder, this.#status, this.#button);
+    this.#card.append(viewfinder, this.#status, this.#button);
     root.append(this.#card);
     if (Object.hasOwn(this, "words")) {
       const { words } = this;
@@ -140,7 +127,7 @@ export class VeilfaceLogin extends Base {
     void this.#forgetClient();
   }
 
-  /** What is sent changes: the camera starts again once the person has read it. */
+  /** What is done changes: the camera starts again. */
   attributeChangedCallback(_: string, old: string | null, now: string | null): void {
     if (old !== now && this.isConnected) this.reset();
   }
@@ -149,10 +136,6 @@ export class VeilfaceLogin extends Base {
   reset(): void {
     this.disconnectedCallback();
     this.connectedCallback();
-  }
-
-  get #sendsFrames(): boolean {
-    return this.getAttribute("liveness") === "head-movements" && !this.#enrolls;
   }
 
   get #enrolls(): boolean {
@@ -168,15 +151,11 @@ export class VeilfaceLogin extends Base {
     return this.getAttribute("service") ?? location.origin;
   }
 
-  /**
-   * Take a burst, lift and send it, or answer a challenge; the decision (or enrollment) also comes
-   * as an event.
-   */
+  /** Take a burst, lift and send it; the decision (or enrollment) also comes as an event. */
   async attempt(): Promise<Decision | Enrollment> {
     const { signal } = this.#stay;
     this.#given();
     signal.throwIfAborted();
-    if (this.#sendsFrames) return this.#challenged(signal);
     this.#enter("busy", this.words.hold);
     const photos = await this.#burst(signal);
     this.#enter("busy", this.words.working);
@@ -210,49 +189,6 @@ export class VeilfaceLogin extends Base {
       return result;
     } finally {
       await client.close();
-    }
-  }
-
-  /**
-   * Say the movements by the clock, and send the frames that were taken meanwhile.
-   *
-   * It does not wait until it sees one: a recording that shows all in turn would be waited for, too.
-   */
-  async #challenged(signal: AbortSignal): Promise<Decision> {
-    const { options } = this.#given();
-    if (!this.words.frames?.trim()) {
-      throw new Error("<veilface-login> sends no photo where words.frames does not say so");
-    }
-    const { subject, token, holderKey } = await this.#authorized(signal, false);
-    const client = new Client(this.#url, token, { ...options, signal });
-    const ask = (movement: string): void => {
-      signal.throwIfAborted();
-      this.#enter("moving", this.words.movements[movement] ?? movement);
-    };
-    const snap = async (wait = 0): Promise<Blob> => {
-      await after(wait);
-      return this.#drawn(signal).canvas.convertToBlob({ type: "image/jpeg", quality: 0.92 });
-    };
-    // A screen reader says each at once, for the clock does not wait.
-    this.#status.setAttribute("aria-live", "assertive");
-    try {
-      ask("front");
-      await after(READY);
-      // Asked for now: its minute begins.
-      const challenge = await client.challenge(subject);
-      const frames = [await snap()];
-      for (const movement of challenge.movements) {
-        ask(movement);
-        for (const wait of OUT) frames.push(await snap(wait));
-        ask(movement === "come_closer" ? "move_back" : "front");
-        frames.push(await snap(BACK));
-      }
-      signal.throwIfAborted();
-      this.#enter("busy", this.words.working);
-      const more = { challenge, face: this.#face };
-      return await client.verify(subject, frames, holderKey ? { ...more, holderKey } : more);
-    } finally {
-      this.#status.setAttribute("aria-live", "polite");
     }
   }
 
@@ -291,8 +227,9 @@ export class VeilfaceLogin extends Base {
   }
 
   #given(): { options: LoginOptions; authorize: () => Promise<Authorization> } {
-    const { options = {}, authorize } = this;
+    const { options, authorize } = this;
     if (authorize === undefined) throw new Error("<veilface-login> needs its property authorize");
+    if (options?.runtime === undefined) throw new Error("<veilface-login> needs the runtime in its options");
     return { options, authorize };
   }
 
@@ -310,11 +247,9 @@ export class VeilfaceLogin extends Base {
 
   async #prepare(signal: AbortSignal): Promise<PrivateClient> {
     const { options, authorize } = this.#given();
-    const { runtime } = options;
-    if (runtime === undefined) throw new Error("<veilface-login> needs the runtime in its options");
     const { token } = await authorize();
     signal.throwIfAborted();
-    const client = new PrivateClient(this.#url, token, { ...options, runtime, signal });
+    const client = new PrivateClient(this.#url, token, { ...options, signal });
     try {
       await client.prepare();
       signal.throwIfAborted();
@@ -360,7 +295,7 @@ export class VeilfaceLogin extends Base {
       await this.#video.play();
       if (signal.aborted) return;
       this.#enter("searching", this.words.waiting);
-      if (!this.#sendsFrames) void this.#guide(camera, signal);
+      void this.#guide(camera, signal);
     } catch (error) {
       if (signal.aborted) return;
       this.#failed(error, this.words.camera);
@@ -400,12 +335,12 @@ export class VeilfaceLogin extends Base {
       const result = await this.attempt();
       if (signal.aborted) return;
       this.#stop();
-      const { accept, reject, notLive, enrolled } = this.words;
+      const { accept, reject, enrolled } = this.words;
       const isRejected = "accepted" in result && !result.accepted;
       const welcome = "accepted" in result ? accept : enrolled;
       // A page that says nothing itself waits for what its own server says.
       if (!isRejected) this.#enter(welcome === "" ? "off" : "accepted", welcome);
-      else this.#enter("rejected", result.reason === "liveness" ? notLive : reject);
+      else this.#enter("rejected", reject);
       this.#tell("veilface-result", result);
     } catch (error) {
       if (signal.aborted) return;
@@ -431,14 +366,8 @@ export class VeilfaceLogin extends Base {
     return photos;
   }
 
-  #photo(signal: AbortSignal): RgbImage {
-    const context = this.#drawn(signal);
-    const { width, height } = context.canvas;
-    return fromImageData(context.getImageData(0, 0, width, height));
-  }
-
   /** What the camera shows now. */
-  #drawn(signal: AbortSignal): OffscreenCanvasRenderingContext2D {
+  #photo(signal: AbortSignal): RgbImage {
     signal.throwIfAborted();
     const { videoWidth: width, videoHeight: height } = this.#video;
     const context = new OffscreenCanvas(width, height).getContext("2d", {
@@ -446,7 +375,7 @@ export class VeilfaceLogin extends Base {
     });
     if (context === null) throw new Error("this browser gives no canvas to take photos with");
     context.drawImage(this.#video, 0, 0);
-    return context;
+    return fromImageData(context.getImageData(0, 0, width, height));
   }
 
   /** It was unplugged, forbidden, or taken by another program. */
@@ -463,14 +392,13 @@ export class VeilfaceLogin extends Base {
     this.#video.srcObject = null;
   }
 
-  /** What is on the page whatever the person does: the button, what is sent, the video's name. */
+  /** What is on the page whatever the person does: the button, and the video's name. */
   #show(): void {
-    const { start, take, enroll, again, frames, video } = this.words;
+    const { start, take, enroll, again, video } = this.words;
     const isOn = this.#camera !== undefined;
     const first = this.#state === "rejected" || this.#state === "failed" ? again : start;
     this.#button.textContent = !isOn ? first : this.#enrolls ? enroll : take;
     this.#button.hidden = this.#state === "accepted";
-    this.#notice.textContent = this.#sendsFrames ? frames : "";
     this.#video.setAttribute("aria-label", video);
     this.#video.hidden = !isOn;
     this.#card.className = `card ${this.#state}${isOn ? " on" : ""}`;
@@ -486,7 +414,7 @@ export class VeilfaceLogin extends Base {
   #wordsOf(error: unknown): string {
     if (!(error instanceof Error)) return String(error);
     const { code, details } = error as Error & { code?: unknown; details?: { liveness?: string } };
-    if (details?.liveness !== undefined && !this.#sendsFrames) return this.words.liveness;
+    if (details?.liveness !== undefined) return this.words.liveness;
     const { errors } = this.words;
     if (typeof code === "string" && Object.hasOwn(errors, code)) return errors[code];
     return code === "locked_out" ? `${error.message}. ${this.words.locked}` : error.message;

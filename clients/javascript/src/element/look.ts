@@ -2,9 +2,9 @@
 
 /**
  * What the person sees: the camera is off; a face is searched for; one is there that will do; photos
- * are taken or judged; head movements are asked for; and how it ended.
+ * are taken or judged; and how it ended.
  */
-export type State = "off" | "searching" | "ready" | "busy" | "moving" | "accepted" | "rejected" | "failed";
+export type State = "off" | "searching" | "ready" | "busy" | "accepted" | "rejected" | "failed";
 
 export const STYLE = `
 :host {
@@ -27,8 +27,6 @@ export const STYLE = `
   display: grid; gap: 0.9rem; padding: 1rem; background: var(--surface);
   border: 1px solid var(--line); border-radius: var(--radius); box-shadow: 0 6px 24px rgb(0 0 0 / 0.1);
 }
-.notice { margin: 0; color: var(--muted); font-size: 0.9rem; text-align: start; }
-.notice:empty { display: none; }
 .viewfinder {
   --outline: var(--muted); --tint: color-mix(in srgb, var(--muted) 12%, var(--surface));
   --figure: color-mix(in srgb, var(--muted) 28%, var(--surface));
@@ -61,8 +59,6 @@ video {
 .accepted .viewfinder::before { content: "✓" / ""; }
 .status { display: grid; place-items: center; min-height: 2.8em; font-weight: 600; text-wrap: balance; }
 .off .status:empty { min-height: 0; }
-.moving .status { font-size: 1.3rem; min-height: 2.2em; }
-.moving button { display: none; }
 .accepted .status { color: var(--good); }
 .rejected .status, .failed .status { color: var(--bad); }
 button {

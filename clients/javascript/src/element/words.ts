@@ -20,11 +20,6 @@ export interface Words {
   readonly camera: string;
   /** What a screen reader calls the picture of the camera. */
   readonly video: string;
-  /** Shown as long as verifications send photos, so before the camera starts. */
-  readonly frames: string;
-  /** By their names in a challenge, and `front` and `move_back`. */
-  readonly movements: Readonly<Record<string, string>>;
-  readonly notLive: string;
   /** Follows the message where too many attempts have failed. */
   readonly locked: string;
   /** The service asks for liveness, and the page for none. */
@@ -51,18 +46,6 @@ export const WORDS: Words = {
   enrolled: "You are enrolled.",
   camera: "The camera cannot be used.",
   video: "Your camera",
-  frames:
-    "To log in, move your head as you are asked to, for about 12 seconds. Photos of that are sent to the service.",
-  movements: {
-    front: "Look straight ahead.",
-    move_back: "Move back and look straight ahead.",
-    turn_left: "Turn your head to the left.",
-    turn_right: "Turn your head to the right.",
-    look_up: "Look up.",
-    look_down: "Look down.",
-    come_closer: "Come closer.",
-  },
-  notLive: "The movements were not seen. Follow each of them, in good light.",
   locked: "An administrator can lift the lock.",
   liveness: "This service checks that a face is live, which takes photos. This page sends none.",
   hints: {
@@ -84,6 +67,5 @@ export const WORDS: Words = {
 export const withDefaults = (given: Partial<Words>): Words => ({
   ...WORDS,
   ...given,
-  movements: { ...WORDS.movements, ...given.movements },
   hints: { ...WORDS.hints, ...given.hints },
 });
