@@ -14,7 +14,6 @@ from api.http.errors import StartError
 from api.http.routes import challenges
 from api.service.runtime import Runtime
 from models.pack import ModelPack
-from templates.store.lockout import LockoutPolicy
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, deploy, images, photo
 from tests.api.living import (
