@@ -1,9 +1,8 @@
 """An attack as its file declares it: what it breaks, what it takes, and what it yields.
 
 A new attack is one function in a file of ``attacks/stored``, which says by :func:`attack` what it
-breaks and what it takes. Its docstring is the assumption that the report prints. It yields one of
-four things: guesses of embeddings, probes to present, scores of two templates, or successes that
-it has counted itself.
+breaks and what it takes. Its docstring is the assumption that the report prints. It yields guesses
+of embeddings, probes to present, or scores of two templates.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -63,17 +62,7 @@ class LinkScores:
     values: NDArray[np.float64]
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Hits:
-    """Victims whom the attack has opened, (V,), and how often guessing would have."""
-
-    hits: NDArray[np.bool_]
-    variant: str
-    chance: float
-    details: Mapping[str, Json] = field(default_factory=dict)
-
-
-Result: TypeAlias = Guesses | Probes | LinkScores | Hits
+Result: TypeAlias = Guesses | Probes | LinkScores
 
 
 @dataclass(frozen=True)
@@ -109,13 +98,5 @@ class Attack:
 def attack(
     *, breaks: Property, needs: Knowledge
 ) -> Callable[[Callable[[Testbed], Iterable[Result]]], Attack]:
-    """Declare a function of a test bed to be an attack.
-
-    Parameters
-    ----------
-    breaks
-        The property that it breaks.
-    needs
-        What it takes.
-    """
+    """Declare a function of a test bed to be an attack: what it breaks, and what it takes."""
     return partial(Attack, breaks=breaks, needs=needs)

@@ -7,18 +7,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from attacks.bed import Effort, Testbed
-from attacks.errors import AuditError
-from attacks.further_faces import SAME_PHOTO, FurtherFaces, strangers_among
-from attacks.outcomes import AttackOutcome
-from attacks.population import Population, draw_population, without_decoy_people
+from attacks.bed import Testbed
+from attacks.outcomes import AttackOutcome, AuditError
+from attacks.population import Population, draw_population
 from attacks.runner import run_attack
 from attacks.setup import AttackSetup
 from attacks.stored import attacks_on_templates
 from models.extraction import Extraction
 from models.pack import ModelPack
 from templates.contract import wire
-from templates.contract.binding import embedding_id
 from templates.contract.document import Binding, Contract
 from templates.decoys import DecoyGenerator, DecoyPool, DecoySource
 from templates.distances import Metric
@@ -27,7 +24,6 @@ from templates.keys.randomness import KEY_BYTES, Keystream
 from templates.keys.rotation import ROTATION_VERSION
 from templates.space.lifting import Strategy
 from verify import CalibrationOptions, calibrate
-from verify.evaluation.attributes import resembling_rows
 from verify.own_decoys import require_others
 
 DEFAULT_SHARE = 0.83
@@ -52,7 +48,6 @@ class AuditPlan:
     victims: int = 300
     owners: int = 600
     comparison: bool = True
-    effort: Effort = field(default_factory=Effort)
     calibration: CalibrationOptions = field(
         default_factory=lambda: CalibrationOptions(
             probe_dims=(0, LIFTED_PROBE_DIM),
@@ -81,8 +76,7 @@ def run_audit(
     identities: Sequence[str],
     *,
     pack: ModelPack,
-    decoys: DecoySource | None,
-    further: Sequence[FurtherFaces] = (),
+    decoys: DecoySource,
     progress: Callable[[float], None] = lambda _share: None,
 ) -> AuditResult:
     """Attack the templates of some people, under every scheme of a plan.
@@ -90,35 +84,21 @@ def run_audit(
     Parameters
     ----------
     decoys
-        What the service lifts with; None to fit a generator to people of no other group.
-    further
-        Faces that the attacker has beside those of ``faces``; the victims are left out.
+        What the service lifts with.
     progress
         Called with the share that is done, which rises to 1.
 
     Raises
     ------
     AuditError
-        There are too few people, or they are in the decoy pool.
+        There are too few people.
     ContractError
         The decoys were made of these people.
     """
     population = draw_population(
         faces.embeddings, identities, victims=plan.victims, owners=plan.owners, seed=plan.seed
     )
-    if decoys is None:
-        fitted, population = without_decoy_people(population, seed=plan.seed)
-        info = pack.info
-        space = embedding_id(embedder_sha256=info.embedder_sha256, preprocessing=info.preprocessing)
-        decoys = DecoyGenerator.fit(fitted, made_with=space)
-    else:
-        if isinstance(decoys, DecoyPool):
-            _require_strangers(decoys, population)
-        require_others(decoys, faces.embeddings, identities)
-    beside = [
-        strangers_among(more, faces.embeddings, identities, population.victim_names)
-        for more in further
-    ]
+    require_others(decoys, faces.embeddings, identities)
     strategy, dims, axes = plan.strategy, plan.dims, plan.axes
     if plan.contract is not None:
         binding = plan.contract.binding
@@ -127,13 +107,12 @@ def run_audit(
     if plan.comparison and strategy.needs_decoys and isinstance(decoys, DecoyGenerator):
         pool = DecoyPool(population.owners.enrolled, made_with=decoys.made_with)
         audited += [(pool, m, True) for m in dims]
-    result = AuditResult([], [], [], _settings(plan, population, decoys, beside))
+    result = AuditResult([], [], [], _settings(plan, population, decoys))
     attacks = list(attacks_on_templates())
     progress(0.0)
     for number, (source, m, compared) in enumerate(audited):
         bed = audit_bed(
-            population, source, strategy, axes=axes, m=m, beside=beside, compared=compared,
-            pack=pack, plan=plan,
+            population, source, strategy, axes=axes, m=m, compared=compared, pack=pack, plan=plan
         )  # fmt: skip
         result.schemes.append({**bed.scheme.to_json(), **_operating_point(bed)})
         if compared:
@@ -151,7 +130,6 @@ def audit_bed(
     *,
     axes: int | None,
     m: int,
-    beside: Sequence[FurtherFaces] = (),
     compared: bool = False,
     pack: ModelPack,
     plan: AuditPlan,
@@ -194,7 +172,7 @@ def audit_bed(
         raise Uncalibrated(
             f"an audit judges by a level with a target FMR, and {contract.default_level} has none"
         )
-    faces, names = _known(population, beside, with_owners=not compared)
+    faces, names = _known(population, with_owners=not compared)
     setup = AttackSetup.of(
         population.victims,
         faces,
@@ -205,7 +183,7 @@ def audit_bed(
     bed = setup.bed(strategy, axes=source.k, m=m, contract=contract)
     # The owners are those of the pool that is compared with, and of no pool of the deployment.
     owners = population.owners.along(source) if compared else None
-    return replace(bed, albums=population.albums, owners=owners, effort=plan.effort)
+    return replace(bed, albums=population.albums, owners=owners)
 
 
 def _calibrated(
@@ -225,29 +203,13 @@ def _calibrated(
     ).contract
 
 
-def _known(
-    population: Population, beside: Sequence[FurtherFaces], *, with_owners: bool
-) -> tuple[NDArray[np.float32], list[str]]:
+def _known(population: Population, *, with_owners: bool) -> tuple[NDArray[np.float32], list[str]]:
     """All photos of other people that a strong attacker has, and whose each is."""
     rows, names = [population.others], [*population.names]
     if with_owners:
         rows += [population.owners.enrolled, population.owners.fresh]
         names += 2 * [f"owner {number}" for number in range(len(population.owners))]
-    for more in beside:
-        rows.append(more.embeddings)
-        names += more.people
-    # A photo of a person without a name is taken for one of a person of its own.
-    return np.concatenate(rows), [name or f"\0{number}" for number, name in enumerate(names)]
-
-
-def _require_strangers(pool: DecoyPool, population: Population) -> None:
-    """Refuse a pool that holds photos of the victims: every attack would find them in it."""
-    shown = np.concatenate([population.victims.enrolled, population.victims.fresh])
-    if len(resembling_rows(pool.entries[0], shown, cosine=SAME_PHOTO)):
-        raise AuditError(
-            "the decoy pool holds photos of PEOPLE, and an attack would find the victims in it: "
-            "give people who are not in the pool"
-        )
+    return np.concatenate(rows), names
 
 
 def _operating_point(bed: Testbed) -> dict[str, Any]:
@@ -259,19 +221,14 @@ def _operating_point(bed: Testbed) -> dict[str, Any]:
     }
 
 
-def _settings(
-    plan: AuditPlan, population: Population, decoys: DecoySource, beside: Sequence[FurtherFaces]
-) -> dict[str, Any]:
+def _settings(plan: AuditPlan, population: Population, decoys: DecoySource) -> dict[str, Any]:
     return {
         "victims": plan.victims,
         "decoy_owners": plan.owners,
-        "attacker_faces": len(_known(population, beside, with_owners=True)[0]),
+        "attacker_faces": len(_known(population, with_owners=True)[0]),
         "calibration_people": len(set(population.names)),
         "calibration": "of the people" if plan.contract is None else "of the contract",
         "contract_id": None if plan.contract is None else plan.contract.contract_id,
         "decoy_source_id": decoys.source_id,
-        "attempts": plan.effort.attempts,
-        "training_seconds": plan.effort.training_seconds,
         "seed": plan.seed,
-        "further_attacker_faces": [more.to_json() for more in beside],
     }

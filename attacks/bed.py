@@ -1,14 +1,12 @@
 """The bed that every attack acts on: people, their templates, and what an attacker has."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from attacks.errors import AuditError
-from attacks.outcomes import GENERATED, POOLED, Scheme
+from attacks.outcomes import GENERATED, POOLED, AuditError, Scheme
 from attacks.second_order import Moments
 from templates.contract.document import Calibration, Contract, Level
 from templates.contract.nobody import Nobody
@@ -94,19 +92,6 @@ class Attacker:
     moments: Moments
 
 
-@dataclass(frozen=True)
-class Effort:
-    """How hard the attacks that take long try.
-
-    ``climbed``: victims whose template is climbed by scores, in ``attempts`` each.
-    ``training_seconds`` is for the inverter; None trains none.
-    """
-
-    climbed: int = 10
-    attempts: int = 1000
-    training_seconds: float | None = None
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class Testbed:
     """People to attack in the coordinates that templates have, and what an attacker has.
@@ -140,8 +125,6 @@ class Testbed:
         People whose ``enrolled`` photos make up the pool of decoys.
     batches
         Several templates of each victim, where an attack has them.
-    memory
-        What an attack has learnt, for the same attack on other templates.
     """
 
     __test__ = False
@@ -160,8 +143,6 @@ class Testbed:
     albums: tuple[Array32, ...] = ()
     owners: Pairs | None = None
     batches: tuple[SubspaceBatch, ...] = ()
-    effort: Effort = field(default_factory=Effort)
-    memory: dict[object, Any] = field(default_factory=dict)
 
     @property
     def m(self) -> int:

@@ -43,7 +43,11 @@ def linked(attack: Attack, bed: Testbed) -> list[AttackOutcome]:
             measured=measured.d_sys,
             chance=measured.null_mean,
             unjudged=CONTROL if setting == ONE_SET else None,
-            details={**measured.details(), "liftings": LIFTINGS},
+            details={
+                "null_95_percent": measured.null_95,
+                "identified_at_rank_1": measured.first_rank,
+                "liftings": LIFTINGS,
+            },
         )
     proven = unproven(rows[ONE_SET], "one set in two rotations")
     return [row if name == ONE_SET else replace(row, unjudged=proven) for name, row in rows.items()]

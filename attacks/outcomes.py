@@ -10,7 +10,12 @@ from numpy.typing import NDArray
 
 from templates.contract.canonical import Json
 from templates.contract.levels import Rate
+from templates.errors import VeilfaceError
 from verify.metrics import rate
+
+
+class AuditError(VeilfaceError):
+    """An attack or an audit that cannot be made as it was ordered."""
 
 
 class Property(StrEnum):
@@ -57,8 +62,6 @@ class KnowledgeLevel(StrEnum):
     """How templates are lifted, the model, the decoy generator (clients have it), other faces."""
     DECOYS = "decoys"
     """The decoy pool, which is a secret of the deployment."""
-    RIGHT = "right"
-    """A right whose answers tell what a template holds: scores, or thousands of decisions."""
     TEMPLATES = "templates"
     """The algorithm, and several templates: of the victim, or of a whole tenant."""
 
@@ -81,8 +84,6 @@ class Knowledge:
         To lift faces as the service does, which of a pool takes the pool.
     pool
         The decoy pool.
-    scores
-        The right to see scores.
     """
 
     template: bool = True
@@ -91,12 +92,9 @@ class Knowledge:
     faces: bool = False
     lifting: bool = False
     pool: bool = False
-    scores: bool = False
 
     def level(self, scheme: "Scheme") -> KnowledgeLevel:
         """Return the column of the report, for templates of a scheme."""
-        if self.scores:
-            return KnowledgeLevel.RIGHT
         if self.several:
             return KnowledgeLevel.TEMPLATES
         if self.pool or (self.lifting and scheme.decoys == POOLED):

@@ -6,13 +6,13 @@ others, whose photos the attacker has. Nobody is in two groups.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from attacks.bed import Pairs
-from attacks.errors import AuditError
+from attacks.outcomes import AuditError
 from templates.space.embedding import normalised, unit_descriptors
 
 ENROLLED_PHOTOS = 3
@@ -40,8 +40,6 @@ class Population:
         Their A names.
     albums
         Embeddings of all photos, (i, n), of each victim with three or more.
-    victim_names
-        Of all victims.
     """
 
     victims: Pairs
@@ -49,7 +47,6 @@ class Population:
     others: Array
     names: tuple[str, ...]
     albums: tuple[Array, ...]
-    victim_names: frozenset[str]
 
 
 def draw_population(
@@ -98,30 +95,7 @@ def draw_population(
         albums=tuple(
             rows[photos[i]].astype(np.float32) for i in attacked if len(photos[i]) >= LEAST_ALBUM
         ),
-        victim_names=frozenset(str(people[i]) for i in attacked),
     )
-
-
-def without_decoy_people(population: Population, *, seed: int) -> tuple[Array, Population]:
-    """Set half of the other people aside, and the decoy owners, to fit decoys to.
-
-    Returns
-    -------
-    embeddings : (D, n) float32
-        Their photos.
-    population
-        Without them among the others.
-    """
-    people = np.random.default_rng([seed, 1]).permutation(np.unique(population.names))
-    fitted = np.isin(population.names, people[: len(people) // 2])
-    kept = replace(
-        population,
-        others=population.others[~fitted],
-        names=tuple(np.asarray(population.names)[~fitted].tolist()),
-    )
-    return np.concatenate(
-        [population.others[fitted], population.owners.enrolled, population.owners.fresh]
-    ), kept
 
 
 def _pairs(rows: NDArray[np.float64], photos: Sequence[NDArray[np.int64]], most: int) -> Pairs:

@@ -1,20 +1,22 @@
-"""Probes that are presented to templates, after the service's input checks."""
+"""Probes that are presented to templates, as the service checks and scores them."""
 
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from attacks.attack import Attack, Hits, Probes
+from attacks.attack import Attack, Probes
 from attacks.bed import Testbed
-from attacks.decisions import fmr_of, score
 from attacks.outcomes import AttackOutcome, Leaked, Property, joined, share_of, unproven
 from attacks.rotations import rotations_of, turned_probes
 from templates.contract.document import Calibration
+from templates.contract.nobody import Nobody
+from templates.distances import paired_distances, pairwise_distances, similarity
 from templates.errors import InvalidEmbedding
 from templates.space.embedding import unit_rows
 from templates.space.subspace import SubspaceBatch
 from verify.cohort import Probes as Sent
+from verify.cohort import cohort_statistics, expected_similarity
 
 WITH_KEY, WITHOUT_KEY = "with the key", "without the key"
 
@@ -29,34 +31,15 @@ def presented(attack: Attack, bed: Testbed) -> list[AttackOutcome]:
     targets = bed.renewed if attack.breaks is Property.RENEWABILITY else bed.templates
     rows = []
     for made in attack.run(bed):
-        if isinstance(made, Hits):
-            rows.append(
-                attack.row(
-                    bed,
-                    variant=made.variant,
-                    leaked=Leaked.DATABASE,
-                    level=bed.level.name,
-                    measured=share_of(made.hits),
-                    chance=made.chance,
-                    details=made.details,
-                )
-            )
         if not isinstance(made, Probes):
-            continue
+            raise TypeError(f"{attack.name} must yield probes")
         if not attack.needs.template:
             rows += _presented(attack, bed, made.sent, targets, made.variant, Leaked.DATABASE)
             continue
-        names = (joined(made.variant, name) for name in (WITH_KEY, WITHOUT_KEY))
-        rotations = rotations_of(bed, "replay", "template", len(targets))
-        known = _presented(attack, bed, made.sent, targets, next(names), Leaked.HOLDER_KEYS)
-        secret = _presented(
-            attack,
-            bed,
-            turned_probes(made.sent, rotations),
-            targets,
-            next(names),
-            Leaked.MASTER_KEY,
-        )
+        with_key, without = (joined(made.variant, name) for name in (WITH_KEY, WITHOUT_KEY))
+        turned = turned_probes(made.sent, rotations_of(bed, "replay", "template", len(targets)))
+        known = _presented(attack, bed, made.sent, targets, with_key, Leaked.HOLDER_KEYS)
+        secret = _presented(attack, bed, turned, targets, without, Leaked.MASTER_KEY)
         rows += known
         rows += [
             replace(row, unjudged=unproven(control, WITH_KEY))
@@ -81,7 +64,7 @@ def _presented(
         return []
     passed = passes_checks(probes, calibration)
     paired = len(probes) > 1  # probe i meets template i, or the only probe meets all
-    accepted = score(probes, targets, bed.nobody, calibration, paired=paired).at(level)
+    accepted = scored(probes, targets, bed.nobody, calibration, paired=paired) >= level.threshold
     hits = (accepted if paired else accepted[0]) & passed
     return [
         attack.row(
@@ -90,13 +73,45 @@ def _presented(
             leaked=leaked,
             level=level.name,
             measured=share_of(hits),
-            chance=fmr_of(level),
+            chance=level.fmr.value if level.target_fmr is None else level.target_fmr,
             details={
                 "mode": calibration.mode,
                 "refused_by_the_input_checks": int(np.count_nonzero(~passed)),
             },
         )
     ]
+
+
+def scored(
+    probes: Sent,
+    templates: SubspaceBatch,
+    nobody: Nobody,
+    calibration: Calibration,
+    *,
+    paired: bool = False,
+    cohort: SubspaceBatch | None = None,
+) -> NDArray[np.float64]:
+    """Score as ``verify.Verifier`` does, (P, T), or (P,) where probe i meets template i only.
+
+    Neither probes nor templates are rotated: a rotation of both changes nothing.
+
+    Parameters
+    ----------
+    probes : (P, k) float32, or SubspaceBatch of P
+    cohort
+        Of lifted probes, instead of the contract's secret one: an attacker tries with one of their
+        own.
+    """
+    compare = paired_distances if paired else pairwise_distances
+    metric, steps = calibration.metric, calibration.steps
+    similarities = similarity(compare(probes, templates, metric=metric, steps=steps))
+    if cohort is not None and isinstance(probes, SubspaceBatch):
+        means, spreads = cohort_statistics(probes, cohort, metric=metric, steps=steps)
+    else:
+        means, spreads = expected_similarity(probes, nobody, metric=metric, steps=steps)
+    if not paired:
+        means, spreads = means[:, None], spreads[:, None]
+    return np.asarray((similarities - means) / spreads, dtype=np.float64)
 
 
 def passes_checks(probes: Sent, calibration: Calibration) -> NDArray[np.bool_]:

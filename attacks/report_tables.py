@@ -10,7 +10,6 @@ from attacks.outcomes import Property, Scheme
 from attacks.report import RESULTS
 from attacks.verdict import LIMITS, NOTHING_JUDGED
 from verify.evaluation.markdown_cells import (
-    count,
     fixed,
     interval_cell,
     percent,
@@ -56,16 +55,7 @@ _ATTRIBUTES: Columns = {
     ),
     "balanced %": lambda row: percent(row["balanced_accuracy"]),
     "chance %": lambda row: percent(row["chance"]),
-    "leakage": lambda row: plain(row["leakage"]),
-}
-_LEVELS: Columns = {
-    "scheme": _scheme,
-    "level": lambda row: (
-        plain(row["name"]) + (" (default)" if row["name"] == row["default_level"] else "")
-    ),
-    "FMR %": lambda row: _share(row["fmr"]),
-    "FNMR %": lambda row: _share(row["fnmr"]),
-    "template, bytes": lambda row: count(row["template_bytes"]),
+    "dealt out %": lambda row: percent(row["chance_of_predictions"]),
 }
 _OUTCOMES: Columns = {
     "attack": lambda row: plain(row["attack"] + (f": {row['variant']}" if row["variant"] else "")),
@@ -92,7 +82,6 @@ def markdown(report: Row) -> str:
         _result(report),
         *_verdicts(report),
         *_attributes(report["rows"]),
-        *_levels(report.get("schemes", ())),
         *_outcomes(report["outcomes"]),
         _settings(report),
     ]
@@ -156,8 +145,8 @@ def _attributes(rows: Sequence[Row]) -> Iterable[str]:
     yield "## Attribute inference"
     yield (
         "Accuracy in % over all attacked faces, with the 95 % Wilson interval; `balanced` is the "
-        "mean over classes; chance is the share of the largest class. Leakage is a difference, up "
-        "or down, from what the same predictions would score if they were dealt out at random."
+        "mean over classes; chance is the share of the largest class. What leaks is a difference, "
+        "up or down, from what the same predictions score where they are *dealt out* at random."
     )
     for attribute in dict.fromkeys(str(row["attribute"]) for row in rows):
         of_attribute = [row for row in rows if row["attribute"] == attribute]
@@ -169,22 +158,6 @@ def _attributes(rows: Sequence[Row]) -> Iterable[str]:
         )
         yield f"Baselines in %: {stated}."
         yield _table(of_attribute, _ATTRIBUTES)
-
-
-def _levels(schemes: Sequence[Row]) -> Iterable[str]:
-    if not schemes:
-        return
-    yield "## What each scheme costs"
-    yield (
-        "Error rates of the calibration at each level, both tests together, in % with the 95 % "
-        "interval; a raw photo is compared with a template of one or more averaged photos."
-    )
-    yield _table(({**scheme, **level} for scheme in schemes for level in scheme["levels"]), _LEVELS)
-
-
-def _share(rate: Row) -> str:
-    value = float(rate["errors"]) / rate["trials"] if rate["trials"] else 0.0
-    return interval_cell({**rate, "value": value})
 
 
 def _outcomes(outcomes: Sequence[Row]) -> Iterable[str]:

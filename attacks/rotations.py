@@ -3,12 +3,11 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from attacks.bed import Testbed
 from templates.keys.randomness import KEY_BYTES, Keystream
 from templates.keys.rotation import SignedCosineRotation, TenantRotation, holder_rotation
-from templates.space.subspace import SubspaceBatch, Turn
+from templates.space.subspace import SubspaceBatch
 from verify.cohort import Probes
 
 KEPT = "holder's key kept"
@@ -36,29 +35,15 @@ def holder_rotations_of(bed: Testbed, enrollment: str, count: int) -> list[Signe
 
 def turned(batch: SubspaceBatch, rotations: Sequence[SignedCosineRotation]) -> SubspaceBatch:
     """Turn each template by its rotation."""
-    return _each_turned(batch, [rotation.turned for rotation in rotations])
-
-
-def turned_back(batch: SubspaceBatch, rotations: Sequence[SignedCosineRotation]) -> SubspaceBatch:
-    """Undo :func:`turned`."""
-    return _each_turned(batch, [rotation.turned_back for rotation in rotations])
-
-
-def _each_turned(batch: SubspaceBatch, turns: Sequence[Turn]) -> SubspaceBatch:
-    pairs = zip(batch, turns, strict=True)
-    return SubspaceBatch.of([template.turned_by(turn) for template, turn in pairs])
+    pairs = zip(batch, rotations, strict=True)
+    return SubspaceBatch.of([template.turned_by(rotation.turned) for template, rotation in pairs])
 
 
 def turned_probes(probes: Probes, rotations: Sequence[SignedCosineRotation]) -> Probes:
     """Turn each probe by its rotation, (V, k) float32 or lifted ones."""
     if isinstance(probes, SubspaceBatch):
         return turned(probes, rotations)
-    return np.ascontiguousarray(turned_points(probes, rotations), dtype=np.float32)
-
-
-def turned_points(
-    points: NDArray[np.floating], rotations: Sequence[SignedCosineRotation]
-) -> NDArray[np.float64]:
-    """Turn each point, (V, k), by its rotation."""
-    pairs = zip(points, rotations, strict=True)
-    return np.concatenate([rotation.turned(point[None]) for point, rotation in pairs])
+    pairs = zip(probes, rotations, strict=True)
+    return np.concatenate([rotation.turned(probe[None]) for probe, rotation in pairs]).astype(
+        np.float32
+    )

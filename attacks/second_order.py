@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from attacks.errors import AuditError
+from attacks.outcomes import AuditError
 from templates.decoys import DecoySource, client_source
 from templates.space.subspace import SubspaceBatch
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attacks.bed import LEAST_VICTIMS, Attacker, Pairs, Testbed
-from attacks.errors import AuditError
+from attacks.outcomes import AuditError
 from attacks.second_order import (
     Moments,
     as_far_as_faces,

@@ -9,9 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from attacks.errors import AuditError
-from attacks.outcomes import Estimate
-from templates.contract.canonical import Json
+from attacks.outcomes import AuditError, Estimate
 
 MOST_BINS = 100
 SCORES_PER_BIN = 10
@@ -23,7 +21,7 @@ _INTERVAL = "bootstrap by person, centred"
 Array64 = NDArray[np.float64]
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass(frozen=True)
 class Unlinkability:
     """D_sys of one linkage score, and what it is on this many scores where nothing links.
 
@@ -33,10 +31,6 @@ class Unlinkability:
         0: genuine and impostor scores are alike; 1: they never meet. The interval resamples people.
     null_mean, null_95
         Mean and 95th percentile of D_sys over permutations of who is paired with whom.
-    edges : (bins + 1,) float64
-        Bins of equal width over all scores.
-    local : (bins,) float64
-        D(s): how much a score in the bin speaks for one person rather than two.
     first_rank
         Share of rows whose mate has the highest score of the row: identification at rank 1.
     """
@@ -44,25 +38,7 @@ class Unlinkability:
     d_sys: Estimate
     null_mean: float
     null_95: float
-    edges: Array64
-    local: Array64
-    genuine: int
-    impostor: int
-    permutations: int
     first_rank: float
-
-    def details(self) -> dict[str, Json]:
-        """Return the figures beside D_sys and the null's mean."""
-        return {
-            "null_95_percent": self.null_95,
-            "permutations": self.permutations,
-            "bins": len(self.local),
-            "mated_scores": self.genuine,
-            "non_mated_scores": self.impostor,
-            "identified_at_rank_1": self.first_rank,
-            "score_edges": [float(edge) for edge in self.edges],
-            "local_d": [float(value) for value in self.local],
-        }
 
 
 def local_d(genuine: Array64, impostor: Array64) -> Array64:
@@ -136,13 +112,11 @@ def unlinkability(
         return genuine.astype(np.float64), every - genuine
 
     own = np.arange(people)
-    genuine, impostor = histograms(own)
     shuffles = [histograms(rng.permutation(people)) for _ in range(permutations)]
     null = global_d(np.stack([m for m, _ in shuffles]), np.stack([n for _, n in shuffles]))
-    value = float(global_d(genuine, impostor))
+    value = float(global_d(*histograms(own)))
     spread = _bootstrap(bin_of, count, rng)
     low, high = np.quantile(spread - spread.mean(), (0.025, 0.975))
-    best = values.argmax(axis=2)
     return Unlinkability(
         d_sys=Estimate(
             value=value,
@@ -153,12 +127,7 @@ def unlinkability(
         ),
         null_mean=float(null.mean()),
         null_95=float(np.quantile(null, 0.95)),
-        edges=edges,
-        local=local_d(genuine, impostor),
-        genuine=liftings * people,
-        impostor=liftings * people * (people - 1),
-        permutations=permutations,
-        first_rank=float((best == own).mean()),
+        first_rank=float((values.argmax(axis=2) == own).mean()),
     )
 
 

@@ -96,8 +96,8 @@ LIMITS: tuple[Limit, ...] = (
     Limit(
         WITH_KEY,
         1.0,
-        "what no template withstands: success by a right to scores, or where every key leaked and "
-        "templates are sent, or several are of one person",
+        "what no template withstands where every key leaked: it is sent itself, or several are of "
+        "one person",
     ),
     Limit(
         WITHOUT_KEY,
@@ -122,7 +122,6 @@ _BY_DESIGN = {
     Property.IMPERSONATION: "an un-rotated template holds vectors that it accepts",
 }
 """Why no template can hold what is without a limit."""
-_BY_ANSWERS = "scores tell what a template is near to, and no lock ends them once one was accepted"
 _BY_ATTACK = {"foot-point": FOOT_POINT}
 """Attacks with a limit of their own, and so a cell of their own."""
 
@@ -156,24 +155,10 @@ class Cell:
 
     @property
     def reason(self) -> str | None:
-        """Why a cell cannot hold: by design, if nobody set a limit; or if its level explains it."""
-        if self.status is Status.FAIL and self._fails_by_chance:
-            return (
-                f"the false match rate of {self.outcome.level} alone gives "
-                f"{self.outcome.chance:.3g}; calibrate on more people, who resolve a stricter level"
-            )
+        """Why nobody can set a limit: what succeeds does so by design."""
         if self.status is not Status.UNLIMITED or self.limit != WITH_KEY:
             return None
-        if self.outcome.knowledge is KnowledgeLevel.RIGHT:
-            return _BY_ANSWERS
         return _BY_DESIGN.get(self.outcome.breaks)
-
-    @property
-    def _fails_by_chance(self) -> bool:
-        """Whether an attack that learns nothing exceeds the limit too, and this may be one."""
-        if self.outcome.breaks in (Property.CONFIDENTIALITY, Property.UNLINKABILITY):
-            return False  # compared with chance
-        return self.low <= self.outcome.chance and self.outcome.chance > self.most
 
     @property
     def rank(self) -> tuple[int, float]:
@@ -258,39 +243,32 @@ def judge(
         One a scheme, in the order of their first outcome.
     """
     most = {limit.name: limit.default for limit in LIMITS} | dict(limits or {})
-    by_scheme: dict[Scheme, dict[tuple[Property, Leaked, KnowledgeLevel, str], Cell]] = {}
-    unjudged: dict[Scheme, list[AttackOutcome]] = {}
+    by_scheme: dict[Scheme, list[AttackOutcome]] = {}
     for outcome in outcomes:
-        if outcome.unjudged not in (CONTROL, COMPARED):
-            by_scheme.setdefault(outcome.scheme, {})
-        if not outcome.judged:
-            unjudged.setdefault(outcome.scheme, []).append(outcome)
+        by_scheme.setdefault(outcome.scheme, []).append(outcome)
+    verdicts = []
+    for scheme, rows in by_scheme.items():
+        if all(row.unjudged in (CONTROL, COMPARED) for row in rows):
             continue
-        cell = cell_of(outcome, most)
-        cells = by_scheme[outcome.scheme]
-        key = (outcome.breaks, outcome.leaked, outcome.knowledge, cell.limit)
-        if key not in cells or cell.rank > cells[key].rank:
-            cells[key] = cell
-    properties, thefts, knowledge = list(Property), list(Leaked), list(KnowledgeLevel)
-    return [
-        Verdict(
-            scheme,
-            tuple(
-                cells[key]
-                for key in sorted(
-                    cells,
-                    key=lambda key: (
-                        properties.index(key[0]),
-                        thefts.index(key[1]),
-                        knowledge.index(key[2]),
-                        key[3],
-                    ),
-                )
-            ),
-            tuple(unjudged.get(scheme, ())),
-        )
-        for scheme, cells in by_scheme.items()
-    ]
+        cells: dict[tuple[int, int, int, str], Cell] = {}
+        for cell in (cell_of(row, most) for row in rows if row.judged):
+            place = _place(cell)
+            if place not in cells or cell.rank > cells[place].rank:
+                cells[place] = cell
+        unjudged = tuple(row for row in rows if not row.judged)
+        verdicts.append(Verdict(scheme, tuple(cells[place] for place in sorted(cells)), unjudged))
+    return verdicts
+
+
+def _place(cell: Cell) -> tuple[int, int, int, str]:
+    """Where a cell stands: properties, thefts and knowledge in their own orders."""
+    row = cell.outcome
+    return (
+        list(Property).index(row.breaks),
+        list(Leaked).index(row.leaked),
+        list(KnowledgeLevel).index(row.knowledge),
+        cell.limit,
+    )
 
 
 def cell_of(outcome: AttackOutcome, most: Mapping[str, float]) -> Cell:
@@ -298,23 +276,20 @@ def cell_of(outcome: AttackOutcome, most: Mapping[str, float]) -> Cell:
     name = _limit_of(outcome)
     measured = outcome.measured
     value, low, high = measured.value, measured.ci_low, measured.ci_high
-    if isinstance(measured, Rate) and measured.interval == "wilson":
-        high = upper_bound(measured.errors, measured.trials)
     if outcome.breaks is Property.CONFIDENTIALITY:
-        low, high = measured.ci_low, measured.ci_high
         gain = float(str(outcome.details["raw_gain"]))
         value, low, high = (one / gain for one in _distance(outcome.chance, value, low, high))
     elif outcome.breaks is Property.UNLINKABILITY:
         # D_sys below its null is chance, and tells nothing.
         value, low, high = (max(0.0, bound - outcome.chance) for bound in (value, low, high))
+    elif isinstance(measured, Rate) and measured.interval == "wilson":
+        high = upper_bound(measured.errors, measured.trials)
     return Cell(outcome, name, most[name], value, low, high)
 
 
 def _limit_of(outcome: AttackOutcome) -> str:
     several = outcome.knowledge is KnowledgeLevel.TEMPLATES
     of_a_template = outcome.breaks in _OF_A_TEMPLATE and not several
-    if outcome.knowledge is KnowledgeLevel.RIGHT:
-        return WITH_KEY
     if outcome.leaked is Leaked.HOLDER_KEYS and not of_a_template:
         return WITH_KEY
     if outcome.leaked is Leaked.MASTER_KEY and outcome.breaks in (
@@ -381,8 +356,7 @@ _SAID = {
 def _sentence(cell: Cell) -> str:
     outcome = cell.outcome
     bound = "" if cell.status is Status.UNLIMITED else f", limit {cell.most:.3g}"
-    why = "By design" if cell.status is Status.UNLIMITED else "It cannot hold"
-    reason = "" if cell.reason is None else f" {why}: {cell.reason}."
+    reason = "" if cell.reason is None else f" By design: {cell.reason}."
     return (
         f"{outcome.breaks} {_SAID[cell.status]}: {outcome.name}, leaked {outcome.leaked}, "
         f"attacker with {outcome.knowledge}: "

@@ -1,21 +1,20 @@
 """``veilface audit fairface``: what templates tell about gender, race and age."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from api.cli.audit_report import (
+    Limits,
     Out,
     Seed,
+    limits_of,
     model_json,
     reported,
     served_scheme,
-    share_once_begun,
-    takes_limits,
 )
-from api.cli.console import message
+from api.cli.console import share_done
 from api.cli.descriptors import BULK, Aligned, Cache, Flip, bulk_pack, extract
 from api.cli.errors import UsageError, require_extra
 from api.cli.inputs import fairface_labels, listed_dims, listed_names, load_decoys
@@ -35,7 +34,6 @@ from attacks.attributes.audit import (
     labelled_faces,
     run_attribute_audit,
 )
-from attacks.attributes.experiment import KNN, LOGISTIC
 from attacks.attributes.plan import OUR_DIMS, PAPER_DIMS, AttributePlan, schemes_of
 from attacks.outcomes import GENERATED, RAW, Scheme
 from attacks.population import LEAST_FITTED
@@ -45,7 +43,6 @@ from templates.contract.document import Binding
 from templates.decoys import DecoyGenerator
 from templates.distances import on_device
 from templates.space.lifting import Strategy
-from verify.fairface_labels import CLASSES
 from verify.preparation import acquired_json
 
 STRATEGIES = (
@@ -55,11 +52,9 @@ STRATEGIES = (
     Strategy.HYBRID,
     Strategy.HYBRID_PLUS,
 )
-ATTACKERS = (KNN, LOGISTIC)
 
 
 @reports(*BULK)
-@takes_limits("attribute-leakage")
 def fairface(
     root: Annotated[
         Path,
@@ -70,7 +65,6 @@ def fairface(
     ],
     *,
     settings: Settings,
-    limits: Mapping[str, float],
     lifting: Annotated[
         int | None,
         typer.Option(
@@ -89,7 +83,6 @@ def fairface(
             min=50, help="Most validation faces that are attacked. Unset: all.", show_default=False
         ),
     ] = None,
-    attributes: Annotated[str, typer.Option(help="What is inferred.")] = ",".join(CLASSES),
     strategy: Annotated[
         str, typer.Option(help="Strategies with the decoys of the lifting database.")
     ] = ",".join(STRATEGIES),
@@ -100,19 +93,9 @@ def fairface(
             help="Dimensions of adversarial lifting with generated decoys, beside --service-dim."
         ),
     ] = ",".join(map(str, OUR_DIMS)),
-    attackers: Annotated[str, typer.Option(help="Who attacks; `knn` is the paper's.")] = ",".join(
-        ATTACKERS
-    ),
-    neighbours: Annotated[int, typer.Option("--k", min=1, help="Neighbours of `knn`.")] = 10,
-    drop_duplicates: Annotated[
-        float | None,
-        typer.Option(
-            min=0.0,
-            max=1.0,
-            help="Leave out near-duplicates: faces that resemble a training face to this cosine, "
-            "such as 0.8.",
-        ),
-    ] = None,
+    neighbours: Annotated[
+        int, typer.Option("--k", min=1, help="Neighbours of the paper's attacker.")
+    ] = 10,
     decoys: Annotated[
         Path | None,
         typer.Option(
@@ -141,6 +124,7 @@ def fairface(
     flip: Flip = False,
     cache: Cache = None,
     device: Device = PROCESSOR,
+    limit: Limits = None,
     out: Out = Path("audit-fairface"),
     _quick: Annotated[
         bool, quick(lifting=300, attack=700, attacked=300, dim="4,16", generated_dim="16,64")
@@ -157,15 +141,10 @@ def fairface(
     Example: `veilface audit fairface fairface --pack buffalo_l --out audit`
     """
     require_extra("audit")
+    limits = limits_of(limit)
     torch_device = chosen_device(device)
     pack = bulk_pack(settings, flip=flip, why="an audit attacks embeddings of a model pack")
-    wanted = listed_names(attributes, tuple(CLASSES), "--attributes")
     strategies = listed_names(strategy, STRATEGIES, "--strategy")
-    if Strategy.HYBRID_PLUS in strategies and not {"gender", "race"} <= set(wanted):
-        raise UsageError(
-            "hybrid+ chooses decoys by gender and race: add both to --attributes, or leave hybrid+ "
-            "out of --strategy"
-        )
     generator, served = _deployed(decoys, settings, pack)
     if served is not None:
         axes, service_dim = axes or served.axes, service_dim or served.m
@@ -182,19 +161,15 @@ def fairface(
         generated_dims=tuple(dict.fromkeys((*ours, service_dim))),
         axes=axes,
     )
-    trained = LOGISTIC in listed_names(attackers, ATTACKERS, "--attackers")
     audited = Scheme(str(Strategy.ADVERSARIAL), GENERATED, service_dim, axes)
     labels = fairface_labels(root, "train"), fairface_labels(root, "val")
     plan = AttributePlan(
         schemes=schemes,
-        attributes=wanted,
         k=neighbours,
-        trained=trained,
         lifting=default_lifting(len(labels[0])) if lifting is None else lifting,
         attack=attack,
         attacked=attacked,
         axes=axes,
-        drop_duplicates=drop_duplicates,
         seed=seed,
     )
     plan.attacker_faces(len(labels[0]))
@@ -202,20 +177,20 @@ def fairface(
     for part in plan.sample(*labels):
         extraction = extract(pack, list(part), aligned=aligned, settings=settings, cache=cache)
         photos.append(extraction)
-        faces.append(labelled_faces(extraction, part, wanted))
-    with share_once_begun("attacking templates") as report_share, on_device(torch_device):
-        audit = run_attribute_audit(plan, *faces, generator=generator, progress=report_share)
-    if drop_duplicates is not None:
-        message(f"note: {audit.duplicates} faces resemble a training face and are not attacked")
+        faces.append(labelled_faces(extraction, part))
+    with share_done("attacking templates") as report_share, on_device(torch_device):
+        rows, parts = run_attribute_audit(plan, *faces, generator=generator, progress=report_share)
     report = document(
         "fairface",
-        outcomes=attribute_outcomes(audit.rows, audited=audited),
-        rows=[row.to_json() for row in audit.rows],
+        outcomes=attribute_outcomes(rows, audited=audited),
+        rows=[row.to_json() for row in rows],
         limits=limits,
         model=model_json(pack),
         settings={
             "root": root.resolve().name,
-            **audit.settings(),
+            "lifting": len(parts.lifting),
+            "attack": len(parts.attack),
+            "attacked": len(parts.attacked),
             "k": neighbours,
             "decoys": "of the lifting faces" if generator is None else generator.source_id,
             "audited": str(audited),

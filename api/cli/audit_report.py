@@ -1,17 +1,14 @@
 """What ``veilface audit`` writes and shows, and the limits that it takes."""
 
-import functools
-import inspect
 import json
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 import typer
 
-from api.cli.console import demo_notice, message, share_done
-from api.cli.errors import FAILED
+from api.cli.console import demo_notice, message
+from api.cli.errors import FAILED, UsageError
 from api.cli.html_report import write_html
 from api.cli.results import Result, Table
 from api.settings import Settings
@@ -28,72 +25,47 @@ from verify.preparation import recorded_of
 
 Out = Annotated[Path, typer.Option(help="Folder of the report.")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed for the random choices.")]
+Limits = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--limit",
+        metavar="NAME=SHARE",
+        help="Most that passes; may be repeated. Unset: "
+        + ", ".join(f"`{limit.name}={limit.default:g}`" for limit in LIMITS)
+        + ". The report says what each limits; 1 limits nothing.",
+    ),
+]
 
 NOT_SHOWN = 3
 """Exit status where nothing fails, and not everything is shown to hold."""
 CAPTIONS = {
     "figure": "Attributes inferred from templates, by dimension",
-    "linkage": "Local linkability D(s) of the templates of two tenants",
     "oracle": "What the paper's oracle gets",
 }
 
-R = TypeVar("R")
 
+def limits_of(given: Sequence[str] | None) -> dict[str, float]:
+    """Read ``NAME=SHARE`` texts: the limits by name, the defaults where none is given.
 
-def takes_limits(*names: str) -> Callable[[Callable[..., R]], Callable[..., R]]:
-    """Give a command a flag ``--max-NAME`` for each named limit.
-
-    The command's parameter ``limits`` receives their values by name.
+    Raises
+    ------
+    UsageError
+        No such limit, or no share from 0 to 1.
     """
-    chosen = {
-        f"max_{limit.name.replace('-', '_')}": limit for limit in LIMITS if limit.name in names
-    }
-
-    def decorate(command: Callable[..., R]) -> Callable[..., R]:
-        @functools.wraps(command)
-        def run(**given: Any) -> R:
-            limits = {limit.name: given.pop(flag) for flag, limit in chosen.items()}
-            return command(limits=limits, **given)
-
-        flags = [
-            inspect.Parameter(
-                flag,
-                inspect.Parameter.KEYWORD_ONLY,
-                default=limit.default,
-                annotation=Annotated[
-                    float,
-                    typer.Option(
-                        min=0.0,
-                        max=1.0,
-                        help=f"Limit: {limit.meaning}.",
-                        rich_help_panel="Limits",
-                    ),
-                ],
+    limits = {limit.name: limit.default for limit in LIMITS}
+    for text in given or ():
+        name, _, share = text.partition("=")
+        try:
+            value = float(share)
+        except ValueError:
+            value = -1.0
+        if name not in limits or not 0 <= value <= 1:
+            raise UsageError(
+                f"--limit takes NAME=SHARE, a share from 0 to 1 and a name of {', '.join(limits)}, "
+                f"not {text!r}"
             )
-            for flag, limit in chosen.items()
-        ]
-        own = [p for p in inspect.signature(command).parameters.values() if p.name != "limits"]
-        run.__signature__ = inspect.Signature([*own, *flags])  # type: ignore[attr-defined]
-        return run
-
-    return decorate
-
-
-@contextmanager
-def share_once_begun(description: str) -> Iterator[Callable[[float], None]]:
-    """Show per cent as :func:`share_done` does, from the first share that is reported.
-
-    An audit may refuse what it was given before it begins: no bar stands above that sentence.
-    """
-    with ExitStack() as stack:
-        shown: list[Callable[[float], None]] = []
-
-        def report(share: float) -> None:
-            if not shown:
-                shown.append(stack.enter_context(share_done(description)))
-            shown[0](share)
-
-        yield report
+        limits[name] = value
+    return limits
 
 
 def write_report(report: Document, out: Path) -> list[Path]:

@@ -1,25 +1,23 @@
 """``veilface audit templates``: every attack on a template that we know, on people with photos."""
 
-from collections.abc import Mapping
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from api.cli.audit_report import (
+    Limits,
     Out,
     Seed,
+    limits_of,
     model_json,
     reported,
     served_scheme,
-    share_once_begun,
-    takes_limits,
 )
-from api.cli.console import message
+from api.cli.console import message, share_done
 from api.cli.descriptors import BULK, Aligned, Cache, Flip, bulk_pack, extract
 from api.cli.errors import UsageError, require_extra
-from api.cli.inputs import further_faces, listed_dims, load_decoys
+from api.cli.inputs import listed_dims, load_decoys
 from api.cli.options import (
     DEFAULT_DIM,
     PROCESSOR,
@@ -31,10 +29,8 @@ from api.cli.results import Plan, Result, reports
 from api.service.opening import file_sealer, open_keyring
 from api.settings import Settings
 from attacks.audit import AuditPlan, run_audit
-from attacks.bed import Effort
 from attacks.population import LEAST_FITTED
 from attacks.report import document
-from attacks.stored.inverter import need
 from templates.contract.document import Contract
 from templates.distances import on_device
 from templates.space.lifting import Strategy
@@ -43,15 +39,6 @@ from verify.preparation import acquired_json
 
 
 @reports(*BULK)
-@takes_limits(
-    "foot-point-success",
-    "recovery-success",
-    "linkability",
-    "renewed-success",
-    "false-acceptance",
-    "success-with-key",
-    "success-without-key",
-)
 def templates(
     people: Annotated[
         Path,
@@ -63,19 +50,10 @@ def templates(
     ],
     *,
     settings: Settings,
-    limits: Mapping[str, float],
     decoys: Annotated[
         Path | None,
         typer.Option(help="The file of `decoys build`. Unset: `decoys.veil` in `data_dir`."),
     ] = None,
-    fit_decoys: Annotated[
-        bool,
-        typer.Option(
-            "--fit-decoys",
-            help="Instead of --decoys, fit decoys to people of PEOPLE who play no other part: "
-            "decoys of the same kind of people and photos.",
-        ),
-    ] = False,
     contract: Annotated[
         Path | None,
         typer.Option(
@@ -119,42 +97,17 @@ def templates(
             "work."
         ),
     ] = True,
-    climbed: Annotated[
-        int, typer.Option(min=1, help="Victims whose template is climbed by scores.")
-    ] = 10,
-    attempts: Annotated[
-        int, typer.Option(min=50, help="Most attempts of a climber on one victim.")
-    ] = 1000,
-    learned: Annotated[
-        bool | None,
-        typer.Option(
-            "--learned/--no-learned",
-            help="Train an inverter (extra `torch`). Unset: where torch is installed.",
-        ),
-    ] = None,
-    training_seconds: Annotated[
-        float, typer.Option(min=1, help="Most seconds of training.")
-    ] = 120.0,
-    attacker_faces: Annotated[
-        list[Path] | None,
-        typer.Option(
-            help="Further faces that the attacker has: a folder of photos, or a `.npz` with "
-            "`paths` and `descriptors` of the same pack. May be repeated. Photos of victims and "
-            "of their namesakes are left out."
-        ),
-    ] = None,
     seed: Seed = 0,
     aligned: Aligned = False,
     flip: Flip = False,
     cache: Cache = None,
     device: Device = PROCESSOR,
+    limit: Limits = None,
     out: Out = Path("audit-templates"),
-    _quick: Annotated[
-        bool, quick(victims=50, owners=100, climbed=2, attempts=200, training_seconds=20)
-    ] = False,
+    _quick: Annotated[bool, quick(victims=50, owners=100)] = False,
     _plan: Plan = None,
 ) -> Result:
-    """Attack private templates: inversion, linkage, renewal, impersonation, climbing.
+    """Attack private templates: inversion, linkage, renewal, impersonation.
 
     Writes report.json, report.md, figures and report.html, which has all in one file, to --out.
     Without --contract, --strategy, --dim and --axes are those of the contract in `data_dir` where
@@ -164,14 +117,8 @@ def templates(
     Example: `veilface audit templates lfw --pack buffalo_l --decoys decoys.veil --out audit`
     """
     require_extra("audit")
+    limits = limits_of(limit)
     torch_device = chosen_device(device)
-    if fit_decoys and (decoys is not None or contract is not None):
-        raise UsageError("--fit-decoys fits decoys of its own: give no --decoys and no --contract")
-    if learned:
-        need("torch")
-    train = find_spec("torch") is not None if learned is None else learned
-    if not train:
-        message("note: no inverter is trained: torch is not installed, or --no-learned is set")
     pack = bulk_pack(settings, flip=flip, why="an audit attacks embeddings of a model pack")
     sealer = file_sealer(open_keyring(settings))
     loaded = None if contract is None else Contract.load(contract, sealer)
@@ -179,25 +126,15 @@ def templates(
         raise UsageError(
             "a contract says its strategy, dimension and axes: leave out --strategy, --dim, --axes"
         )
-    source = (
-        None if fit_decoys else load_decoys(decoys or settings.resolved_decoys_file, sealer, pack)
-    )
-    if loaded is not None and source is not None:
+    source = load_decoys(decoys or settings.resolved_decoys_file, sealer, pack)
+    if loaded is not None:
         own = source.reduced(loaded.binding.axes)
         loaded.binding.require_source(source_id=own.source_id, made_with=own.made_with)
-    if loaded is None and (dim is None or strategy is None or axes is None):
-        served = served_scheme(settings, sealer, source)
-        if dim is None:
-            dim = str(DEFAULT_DIM if served is None else served.m)
-        if strategy is None:
-            strategy = Strategy.ADVERSARIAL if served is None else served.strategy
-        if axes is None and served is not None:
-            axes = served.axes
-        if served is not None:
-            path = settings.resolved_contract_file
-            message(
-                f"note: auditing {strategy} templates of m = {dim}: what is not set is {path}'s"
-            )
+    elif (served := served_scheme(settings, sealer, source)) is not None:
+        dim, strategy = dim or str(served.m), strategy or served.strategy
+        axes = axes or served.axes
+        path = settings.resolved_contract_file
+        message(f"note: auditing {strategy} templates of m = {dim}: what is not set is {path}'s")
     # Of a contract both are its own.
     dim, strategy = dim or str(DEFAULT_DIM), strategy or Strategy.ADVERSARIAL
     plan = AuditPlan(
@@ -208,24 +145,18 @@ def templates(
         victims=victims,
         owners=owners,
         comparison=comparison,
-        effort=Effort(climbed, attempts, training_seconds if train else None),
         seed=seed,
     )
     labelled = labelled_folder(people)
     faces = extract(pack, labelled.paths, aligned=aligned, settings=settings, cache=cache)
     name_of = dict(zip(labelled.paths, labelled.identities, strict=True))
-    further = [
-        further_faces(path, pack, aligned=aligned, settings=settings, cache=cache)
-        for path in attacker_faces or ()
-    ]
-    with share_once_begun("auditing") as report_share, on_device(torch_device):
+    with share_done("auditing") as report_share, on_device(torch_device):
         result = run_audit(
             plan,
             faces,
             [name_of[path] for path in faces.paths],
             pack=pack,
             decoys=source,
-            further=further,
             progress=report_share,
         )
     report = document(
@@ -237,7 +168,6 @@ def templates(
         settings={
             "people": labelled.root.resolve().name,
             **result.settings,
-            "fit_decoys": fit_decoys,
             "flip": flip,
             "device": device,
         },

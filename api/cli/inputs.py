@@ -2,19 +2,14 @@
 
 import hashlib
 from collections.abc import Callable, Sequence
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import TypeVar
 
-from api.cli.descriptors import extract
 from api.cli.errors import CommandError, UsageError
-from api.cli.photo_folders import find_photos
-from api.settings import Settings
-from attacks.further_faces import FurtherFaces
 from models.pack import ModelPack
 from templates.contract.canonical import Json
 from templates.decoys import DecoySource, load_source
 from templates.keys.sealing import Sealer
-from verify.evaluation.embeddings_file import read_embeddings
 from verify.fairface_labels import Label, read_labels
 from verify.preparation import require_made_with
 
@@ -122,30 +117,3 @@ def load_decoys(file: Path, sealer: Sealer, pack: ModelPack) -> DecoySource:
         )
     require_made_with(source, pack)
     return source
-
-
-def further_faces(
-    source: Path, pack: ModelPack, *, aligned: bool, settings: Settings, cache: Path | None
-) -> FurtherFaces:
-    """Read an attacker's faces: a folder of photos, or a ``.npz`` as ``read_embeddings`` takes it.
-
-    People are named by the folder that a photo lies in, where it is not the source itself.
-
-    Raises
-    ------
-    CommandError
-        No photo gave an embedding.
-    DatasetError
-        The archive is broken.
-    """
-    if source.is_dir():
-        faces = extract(pack, find_photos(source), aligned=aligned, settings=settings, cache=cache)
-        names = tuple(
-            path.parent.name if path.parent.resolve() != source.resolve() else ""
-            for path in faces.paths
-        )
-        return FurtherFaces(source.resolve().name, faces.embeddings, names)
-    rows = read_embeddings(source)
-    return FurtherFaces(
-        source.name, rows.embeddings, tuple(PurePath(path).parent.name for path in rows.paths)
-    )

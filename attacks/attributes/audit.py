@@ -1,21 +1,18 @@
 """The audit of attributes: what the templates of FairFace tell of gender, race and age."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-
-import numpy as np
 
 from attacks.attributes.experiment import run_scheme
 from attacks.attributes.faces import LabelledFaces, Split, split
 from attacks.attributes.plan import AttributePlan, prepare
 from attacks.attributes.rows import AttributeRow, strongest
-from attacks.errors import AuditError
 from attacks.outcomes import (
     COMPARED,
     GENERATED,
     RAW_SCHEME,
     AttackOutcome,
+    AuditError,
     KnowledgeLevel,
     Leaked,
     Property,
@@ -24,7 +21,6 @@ from attacks.outcomes import (
 from attacks.population import LEAST_FITTED
 from models.extraction import Extraction
 from templates.decoys import DecoyGenerator
-from verify.evaluation.attributes import resembling_rows
 from verify.fairface_labels import CLASSES, Label
 from verify.own_decoys import require_others
 
@@ -45,33 +41,13 @@ def default_lifting(training: int) -> int:
     return min(PAPER_LIFTING, max(LEAST_FITTED, int(LIFTING_SHARE * training)))
 
 
-def labelled_faces(
-    photos: Extraction, labels: Mapping[Path, Label], attributes: Sequence[str]
-) -> LabelledFaces:
+def labelled_faces(photos: Extraction, labels: Mapping[Path, Label]) -> LabelledFaces:
     """Join the photos that were embedded with their labels."""
     return LabelledFaces.of_names(
         photos.embeddings,
-        {name: [str(getattr(labels[path], name)) for path in photos.paths] for name in attributes},
-        {name: CLASSES[name] for name in attributes},
+        {name: [str(getattr(labels[path], name)) for path in photos.paths] for name in CLASSES},
+        CLASSES,
     )
-
-
-@dataclass(frozen=True, eq=False)
-class AttributeAudit:
-    """Rows, the parts that faces were dealt into, and how many were dropped as duplicates."""
-
-    rows: list[AttributeRow]
-    split: Split
-    duplicates: int
-
-    def settings(self) -> dict[str, int]:
-        """Return the sizes of the parts, for the report."""
-        return {
-            "lifting": len(self.split.lifting),
-            "attack": len(self.split.attack),
-            "attacked": len(self.split.attacked),
-            "duplicates_dropped": self.duplicates,
-        }
 
 
 def run_attribute_audit(
@@ -81,8 +57,8 @@ def run_attribute_audit(
     *,
     generator: DecoyGenerator | None = None,
     progress: Callable[[float], None] = lambda _share: None,
-) -> AttributeAudit:
-    """Infer attributes from the templates of validation faces.
+) -> tuple[list[AttributeRow], Split]:
+    """Infer attributes from the templates of validation faces: rows, and the parts of faces.
 
     Parameters
     ----------
@@ -97,14 +73,6 @@ def run_attribute_audit(
     AuditError
         There are too few faces for the plan.
     """
-    duplicates = 0
-    if plan.drop_duplicates is not None:
-        # FairFace's two parts share photos, and the victim's own face in hand infers nothing.
-        dropped = resembling_rows(
-            validation.embeddings, train.embeddings, cosine=plan.drop_duplicates
-        )
-        validation = validation.take(np.setdiff1d(np.arange(len(validation)), dropped))
-        duplicates = len(dropped)
     parts = split(
         train,
         validation,
@@ -126,7 +94,7 @@ def run_attribute_audit(
     for number, scheme in enumerate(plan.schemes, start=1):
         rows += run_scheme(ours if scheme.decoys == GENERATED else whole, scheme)
         progress(number / len(plan.schemes))
-    return AttributeAudit(rows, parts, duplicates)
+    return rows, parts
 
 
 def attribute_outcomes(rows: Sequence[AttributeRow], *, audited: Scheme) -> list[AttackOutcome]:
@@ -178,7 +146,6 @@ def attribute_outcomes(rows: Sequence[AttributeRow], *, audited: Scheme) -> list
                     "majority": row.chance,
                     "raw_gain": gains[attribute],
                     "balanced_accuracy": row.balanced_accuracy,
-                    "leakage": str(row.leakage),
                     "chosen_among": "the attacker's own held-out faces",
                 },
             )

@@ -16,8 +16,7 @@ from attacks.attributes.features import features_of
 from attacks.attributes.neighbours import METRICS, Attacked, nearest_neighbours, vote
 from attacks.attributes.plan import Setup, Side
 from attacks.attributes.rows import AttributeRow, measure
-from attacks.errors import AuditError
-from attacks.outcomes import GENERATED, POOLED, RAW_SCHEME, KnowledgeLevel, Scheme
+from attacks.outcomes import GENERATED, POOLED, RAW_SCHEME, AuditError, KnowledgeLevel, Scheme
 from attacks.second_order import likeliest_embeddings
 from attacks.stored.known_pool import find_decoys, strip
 from templates.keys.randomness import Keystream
@@ -77,8 +76,7 @@ def run_scheme(setup: Setup, scheme: Scheme) -> list[AttributeRow]:
         def against(predicted: Codes, truth: Codes) -> AttributeRow:
             return measure(
                 predicted, truth, scheme=scheme, attribute=attribute, attacker=attacker,
-                metric=metric, knowledge=known, classes=classes,
-                training=attack.labels[attribute], seed=plan.seed,
+                metric=metric, knowledge=known, classes=classes, seed=plan.seed,
             )  # fmt: skip
 
         row = against(said, attacked["truth", attribute])
@@ -88,9 +86,9 @@ def run_scheme(setup: Setup, scheme: Scheme) -> list[AttributeRow]:
         # The vote learns from no template, so that all of the attacker's own try it.
         key, truth = (name, metric, attribute), own["truth", attribute]
         add(KNN, metric, KnowledgeLevel.ALGORITHM, attribute, attacked[key], own[key], truth)
-    trained: list[tuple[str, KnowledgeLevel, list[tuple[str, ...]]]] = []
-    if plan.trained:
-        trained.append((LOGISTIC, KnowledgeLevel.ALGORITHM, [("features",)]))
+    trained: list[tuple[str, KnowledgeLevel, list[tuple[str, ...]]]] = [
+        (LOGISTIC, KnowledgeLevel.ALGORITHM, [("features",)])
+    ]
     if ("points",) in attacked:
         name, known = SECOND, KnowledgeLevel.ALGORITHM
         if scheme.decoys == POOLED:

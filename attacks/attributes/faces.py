@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from attacks.errors import AuditError
+from attacks.outcomes import AuditError
 from templates.decoys.source import Attributes, DecoySource
 from templates.space.embedding import unit_descriptors
 

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from attacks.errors import AuditError
+from attacks.outcomes import AuditError
 from templates.distances import Metric, Neighbours, nearest
 from templates.space.subspace import SubspaceBatch
 

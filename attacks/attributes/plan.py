@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from attacks.attributes.faces import LabelledFaces, Split
 from attacks.attributes.features import Axes
-from attacks.errors import AuditError
-from attacks.outcomes import GENERATED, POOLED, RAW_SCHEME, Scheme
+from attacks.outcomes import GENERATED, POOLED, RAW_SCHEME, AuditError, Scheme
 from attacks.second_order import Moments, decoy_moment, drawn_towards
 from templates.decoys import DecoyGenerator, DecoyPool
 from templates.decoys.source import DecoySource
@@ -43,12 +42,8 @@ class AttributePlan:
         None for all.
     axes
         That faces are projected on for generated decoys; None for all.
-    drop_duplicates
-        Cosine from which an attacked face resembles a training face too much; None to keep all.
     k, feature_ks
         Neighbours of the paper's attacker, and those whose shares the trained ones see.
-    trained
-        Train attackers beside the paper's.
     training_most
         Most templates that the attacker lifts to train on. Each of its faces is lifted up to three
         times: labels are scarce, and lifting is free.
@@ -59,16 +54,13 @@ class AttributePlan:
     """
 
     schemes: tuple[Scheme, ...]
-    attributes: tuple[str, ...]
     lifting: int
     attack: int | None = None
     attacked: int | None = None
     axes: int | None = None
-    drop_duplicates: float | None = None
     seed: int = 0
     k: int = 10
     feature_ks: tuple[int, ...] = (10, 50)
-    trained: bool = True
     training_most: int = 10_000
     gallery_most: int = 10_000
 

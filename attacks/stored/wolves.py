@@ -1,23 +1,19 @@
-"""Wolves: probes near every face (docs/method.md §4.7), and probes that are no face at all.
+"""Wolves: probes near every face (docs/method.md §4.7).
 
-Wolves are chosen and improved on templates that the attacker lifts; the victims' templates and the
-service's cohort are met once, at the end.
+They are chosen on templates that the attacker lifts; the victims' templates and the service's
+cohort are met once, at the end.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from attacks.attack import Probes, attack
 from attacks.bed import Testbed
-from attacks.decisions import score
 from attacks.outcomes import Knowledge, Property
-from attacks.point_ascent import ascend_points
-from attacks.presented import passes_checks
-from attacks.wolf_ascent import Ground, ascend_subspaces
-from templates.contract.document import Calibration, Level
+from attacks.presented import passes_checks, scored
+from templates.contract.document import Calibration
 from templates.contract.nobody import Nobody
 from templates.decoys import client_source
 from templates.keys.randomness import KEY_BYTES, Keystream
@@ -27,129 +23,61 @@ from verify.cohort import Probes as Sent
 from verify.comparisons import through_wire
 
 TARGETS = 150
-"""Templates that the attacker lifts to climb on; as many again to choose among the ends."""
-COHORT_CLIMBED = 150
-"""Of the attacker's cohort, those that the score is normalised by while it climbs; all of them
-decide which end is best."""
-STARTS = 6
+"""Templates that the attacker lifts to choose by."""
 AXES = 64
 CENTRAL = "axes through the origin"
 ALONG_MEAN = "foot point along the mean face"
+_LEADING = 6
 _FOOT_FACTORS = (0.8, 1.0, 1.2)
-_FROM_OUTSIDE = Knowledge(template=False, generator=True)
 _LIFTS = Knowledge(template=False, faces=True, lifting=True)
 
 Array = NDArray[np.float64]
 
 
-@attack(breaks=Property.IMPERSONATION, needs=_FROM_OUTSIDE)
-def no_face(bed: Testbed) -> Iterator[Probes]:
-    """The zero vector is sent, or random subspaces through the coordinate origin."""
-    yield Probes(np.zeros((1, bed.source.k), dtype=np.float32), "zero embedding")
-    if bed.lifted is not None:
-        rng = np.random.default_rng(bed.seed)
-        shape = bed.lifted.probe_m, bed.source.k
-        central = [
-            canonical(np.zeros(shape[1]), rng.standard_normal(shape)) for _ in bed.templates.feet
-        ]
-        yield Probes(SubspaceBatch.of(central), "random central subspaces")
-
-
 @attack(breaks=Property.IMPERSONATION, needs=_LIFTS)
 def wolf_embedding(bed: Testbed) -> Iterator[Probes]:
-    """The mean face or a principal axis is sent, or what climbed from them on own templates.
-
-    The best is taken: that which most of the attacker's own templates accept.
-    """
-    own = OwnTemplates.of(bed)
-    plain = plain_wolves(bed.gallery)
-    starts = np.concatenate([plain, bed.gallery[:STARTS]])
-    climbed = ascend_points(starts, own.targets, bed.nobody, threshold=bed.level.threshold)
-    for variant, candidates in (("axes of faces", plain), ("optimised", climbed)):
-        shares = own.accepted_shares(candidates, bed, bed.points, bed.level)
-        yield Probes(candidates[[int(np.argmax(shares))]], variant)
+    """The mean face or a principal axis is sent: what most of the attacker's templates accept."""
+    wolves = plain_wolves(bed.gallery)
+    yield Probes(wolves[_ranked(bed, wolves, bed.points)[:1]], "axes of faces")
 
 
 @attack(breaks=Property.IMPERSONATION, needs=_LIFTS)
 def lifted_wolf(bed: Testbed) -> Iterator[Probes]:
-    """Principal axes of faces are sent as a lifted probe, or what climbed from them.
-
-    The best is taken: that which most of the attacker's own templates accept.
-    """
+    """Principal axes of faces are sent as a lifted probe: what most own templates accept."""
     if bed.lifted is None:
         return
-    calibration, own = bed.lifted, OwnTemplates.of(bed)
-    level = calibration.level(bed.service.default_level)
-    low, high = calibration.foot_point_norm or (0.0, 1.0)
-    wolves = axis_wolves(
-        bed.gallery, calibration.probe_m, foot_norm=(low + high) / 2, seed=bed.seed
-    )
-
-    def best(made: SubspaceBatch) -> SubspaceBatch:
+    low, high = bed.lifted.foot_point_norm or (0.0, 1.0)
+    wolves = axis_wolves(bed.gallery, bed.lifted.probe_m, foot_norm=(low + high) / 2, seed=bed.seed)
+    for family, made in wolves.items():
         received = through_wire(made, contract_id=bed.service.contract_id)
-        honest = passes_checks(received, calibration)
+        honest = passes_checks(received, bed.lifted)
         kept = received[honest] if honest.any() else received
-        shares = own.accepted_shares(kept, bed, calibration, level)
-        return kept[np.argsort(-shares)]
-
-    for family, batch in wolves.items():
-        yield Probes(best(batch)[:1], family)
-    leading = best(SubspaceBatch.of(list(wolves.values())))[:STARTS]
-    ground = Ground.of(own.targets, own.cohort[:COHORT_CLIMBED], level)
-    yield Probes(best(ascend_subspaces(leading, ground))[:1], "optimised")
+        yield Probes(kept[_ranked(bed, kept, bed.lifted)[:1]], family)
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class OwnTemplates:
-    """What the attacker lifts on their own.
+def _ranked(bed: Testbed, wolves: Sent, calibration: Calibration) -> NDArray[np.int64]:
+    """Places of the wolves, those that most of the attacker's own templates accept first.
 
-    Parameters
-    ----------
-    targets, held_out
-        Templates of the attacker's faces: to climb on, and to choose with.
-    cohort
-        Made as the service makes one, which lifted probes are held against.
+    Lifted wolves are held against a cohort of the attacker's own, for the service's is secret.
     """
-
-    targets: SubspaceBatch
-    held_out: SubspaceBatch
-    cohort: SubspaceBatch
-
-    @classmethod
-    def of(cls, bed: Testbed) -> "OwnTemplates":
-        """Lift the attacker's faces, and a cohort with the generator that clients have.
-
-        Templates are lifted with the scheme's decoys, which of a pool takes the pool.
-        """
-        faces = np.random.default_rng(bed.seed).permutation(bed.gallery)[: 2 * TARGETS]
-        half = len(faces) // 2
+    faces = np.random.default_rng(bed.seed).permutation(bed.gallery)[:TARGETS]
+    cohort = None
+    if isinstance(wolves, SubspaceBatch):
         stream = Keystream.seeded("audit", bed.seed, str(bed.scheme), "attacker's cohort")
         seed = stream.token(KEY_BYTES)
         generator = client_source(bed.source)
-        return cls(
-            targets=bed.lift(faces[:half], "attacker's targets"),
-            held_out=bed.lift(faces[half:], "attacker's held-out targets"),
-            cohort=Nobody(generator, plain_strategy(bed.strategy), bed.m, seed).cohort,
-        )
-
-    def accepted_shares(
-        self, probes: Sent, bed: Testbed, calibration: Calibration, level: Level
-    ) -> Array:
-        """Share of the held-out templates that accept each probe.
-
-        Lifted probes are held against the attacker's own cohort, for the service's is secret.
-        Ties, such as where none accepts, are broken by the mean similarity.
-        """
-        scores = score(probes, self.held_out, bed.nobody, calibration, cohort=self.cohort)
-        # Similarities lie in [-1, 1]: their mean, scaled, never outweighs one acceptance.
-        tie = scores.similarities.mean(axis=1) / (4 * len(self.held_out))
-        return np.asarray(scores.at(level).mean(axis=1) + tie, dtype=np.float64)
+        cohort = Nobody(generator, plain_strategy(bed.strategy), bed.m, seed).cohort
+    scores = scored(
+        wolves, bed.lift(faces, "attacker's targets"), bed.nobody, calibration, cohort=cohort
+    )
+    accepted = scores >= calibration.level(bed.service.default_level).threshold
+    return np.lexsort((-scores.mean(axis=1), -accepted.mean(axis=1)))
 
 
 def plain_wolves(faces: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the mean face and principal axes of faces (N, k), alone and with the mean face."""
     mean = faces.mean(axis=0, dtype=np.float64)
-    axes = np.linalg.svd(faces - mean, full_matrices=False)[2][:STARTS]
+    axes = np.linalg.svd(faces - mean, full_matrices=False)[2][:_LEADING]
     length = float(np.linalg.norm(mean))
     rows = np.concatenate([mean[None], axes, -axes, mean + length * axes, mean - length * axes])
     return np.asarray(rows / np.linalg.norm(rows, axis=1, keepdims=True), dtype=np.float32)
@@ -160,28 +88,20 @@ def axis_wolves(
 ) -> dict[str, SubspaceBatch]:
     """Lifted probes of dimension m near everybody, learnt from (N, k) unit embeddings; by family.
 
-    Parameters
-    ----------
-    foot_norm
-        Norm of an honest probe's foot point; wolves have it, a fifth less and a fifth more, and 0.
+    ``foot_norm`` is that of an honest probe's foot point: wolves have it, a fifth less and a fifth
+    more, and 0.
     """
     rng = np.random.default_rng(seed)
     mean = faces.mean(axis=0, dtype=np.float64)
     axes = np.linalg.svd(faces - mean, full_matrices=False)[2][:AXES].astype(np.float64)
     uncentred = np.linalg.svd(faces.astype(np.float64), full_matrices=False)[2][:AXES]
-
-    def bases() -> Iterator[Array]:
-        yield axes[:m]
-        yield uncentred[:m]
-        yield axes[m : 2 * m]
-        for width in (2, 4):
-            taken = axes[: width * m]
-            for _ in range(4):
-                mix = np.linalg.qr(rng.standard_normal((len(taken), m)))[0]
-                yield mix.T @ taken
-
+    bases = [axes[:m], uncentred[:m], axes[m : 2 * m]]
+    for width in (2, 4):
+        taken = axes[: width * m]
+        mixes = (np.linalg.qr(rng.standard_normal((len(taken), m)))[0] for _ in range(4))
+        bases += [mix.T @ taken for mix in mixes]
     wolves: dict[str, list[SubspaceBatch]] = {CENTRAL: [], ALONG_MEAN: []}
-    for basis in bases():
+    for basis in bases:
         wolves[CENTRAL].append(canonical(np.zeros_like(mean), basis))
         for factor in _FOOT_FACTORS:
             direction = mean - basis.T @ (basis @ mean)

@@ -8,7 +8,7 @@ import numpy as np
 
 from attacks.attack import Attack
 from attacks.audit import AuditPlan, audit_bed
-from attacks.bed import Effort, Testbed
+from attacks.bed import Testbed
 from attacks.outcomes import AttackOutcome
 from attacks.population import Population, draw_population
 from attacks.runner import run_attack
@@ -31,7 +31,6 @@ PLAN = AuditPlan(
     axes=AXES,
     victims=VICTIMS,
     owners=OWNERS,
-    effort=Effort(climbed=2, attempts=50),
     calibration=CalibrationOptions(
         probe_dims=(0, 3), probe_photos=(1,), lifted_probes=400, lifted_impostor_pairs=40_000,
         steps=10,

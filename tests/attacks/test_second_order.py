@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from attacks.errors import AuditError
+from attacks.outcomes import AuditError
 from attacks.second_order import (
     RIDGE,
     Moments,

@@ -20,7 +20,6 @@ from tests.api.cli.audit_bench import (
     documented,
     draw_fairface,
     named_in,
-    write_photo,
 )
 from tests.api.cli.conftest import Ran, World, run
 from tests.leaks import LeakSearch
@@ -47,21 +46,19 @@ class FaceAudit:
         return self.root / "out"
 
 
-FEW = ("--attack", "100", "--attacked", "50", "--attackers", "knn", "--attributes", "gender")
+FEW = ("--attack", "100", "--attacked", "50")
 
 
 @pytest.fixture(scope="module")
 def faces(world: World, tmp_path_factory: pytest.TempPathFactory) -> FaceAudit:
     root = tmp_path_factory.mktemp("audited-faces")
     draw_fairface(root / "fairface")
-    # A face of both parts, and a photo that is none.
-    write_photo(root / "fairface" / "val" / "0.png", 9000)
     (root / "fairface" / "train" / "7.png").write_bytes(b"not a picture")
     asked: tuple[str | Path, ...] = (
         *("audit", "fairface", root / "fairface", "--pack", world.pack, "--aligned"),
         *("--data-dir", world.data, "--cache", root / "faces.cache", "--lifting", "100"),
         *("--strategy", "raw,adversarial", "--dim", "2", "--generated-dim", "4"),
-        *("--service-dim", "4", "--attackers", "knn,logistic", "--drop-duplicates", "0.99999"),
+        *("--service-dim", "4"),
     )
     found: list[np.ndarray] = []
     plain = descriptors.extract
@@ -74,7 +71,7 @@ def faces(world: World, tmp_path_factory: pytest.TempPathFactory) -> FaceAudit:
 
         patch.setattr(audit_fairface, "extract", recorded)
         first = run(
-            *asked, "--max-attribute-leakage", "0", "--out", root / "out", "--json",
+            *asked, "--limit", "attribute-leakage=0", "--out", root / "out", "--json",
         )  # fmt: skip
     assert first.status in (0, 1), first.stderr
     assert "error: " not in first.stderr, first.stderr
@@ -122,12 +119,11 @@ def test_the_report_of_faces_is_the_one_that_is_documented(face_report: Any) -> 
 def test_sizes_and_failures_are_told(faces: FaceAudit, face_report: Any) -> None:
     settings = face_report["settings"]
     assert (settings["lifting"], settings["attack"]) == (100, TRAIN - 1 - 100)
-    assert (settings["attacked"], settings["duplicates_dropped"]) == (VALIDATION - 1, 1)
+    assert settings["attacked"] == VALIDATION
     assert settings["root"] == "fairface"
     failed = face_report["failure_to_acquire"]
     assert failed["train"] == {"photos": TRAIN, "failed": 1, "reasons": {"unsupported_image": 1}}
     assert failed["val"]["failed"] == 0
-    assert "note: 1 faces resemble a training face and are not attacked" in faces.first.stderr
 
 
 def test_ages_of_spreadsheets_are_ages(face_report: Any) -> None:
@@ -171,7 +167,7 @@ def test_a_limit_that_is_exceeded_is_status_1(faces: FaceAudit, face_report: Any
 def test_the_seed_gives_the_rows_and_a_kept_limit_is_status_0(
     faces: FaceAudit, face_report: Any
 ) -> None:
-    more = ("--max-attribute-leakage", "1", "--out", faces.root / "again")
+    more = ("--limit", "attribute-leakage=1", "--out", faces.root / "again")
     again = run(*faces.asked, *more)
     assert (again.status, again.stderr.count("error")) == (0, 0)
     assert again.stdout.splitlines()[0] == "PASSED"
@@ -197,7 +193,7 @@ def test_only_the_photos_that_the_limits_ask_for_are_embedded(
     assert ran.status in (0, 1, 3), ran.stderr
     acquired, settings = ran.json["failure_to_acquire"], ran.json["settings"]
     assert (acquired["train"]["photos"], acquired["val"]["photos"]) == (200, 50)
-    assert (settings["lifting"], settings["attacked"]) == (100, 50 - settings["duplicates_dropped"])
+    assert (settings["lifting"], settings["attacked"]) == (100, 50)
     assert settings["attack"] == 100 - acquired["train"]["failed"]
     # A bar from 0 to 100 %, not a count of products of descriptors.
     assert shares == sorted(shares)
@@ -210,7 +206,7 @@ def test_the_verdict_is_a_table_on_the_terminal(faces: FaceAudit) -> None:
     """Rows as in the report: the property, who the attacker was, what it reached, the limit."""
     limit = 0.0125
     ran = run(
-        *(*faces.asked, *FEW, "--max-attribute-leakage", str(limit)),
+        *(*faces.asked, *FEW, "--limit", f"attribute-leakage={limit}"),
         *("--out", faces.root / "table"),
     )
     lines = ran.stdout.splitlines()

@@ -23,7 +23,6 @@ from attacks.bed import Testbed
 from attacks.outcomes import KnowledgeLevel, Property
 from attacks.population import Population
 from attacks.runner import run_attack
-from attacks.stored import wolves
 from attacks.stored.foot_point import foot_point
 from attacks.stored.known_pool import known_pool
 from attacks.verdict import LIMITS, Status
@@ -36,6 +35,8 @@ from tests.api.cli.conftest import DIM, Ran, World, run
 from tests.attacks.beds import bed_of
 from tests.leaks import LeakSearch
 from verify import calibrate
+
+WITHOUT_LIMITS = [f"--limit={limit.name}=1" for limit in LIMITS]
 
 
 @dataclass(frozen=True)
@@ -62,8 +63,6 @@ def on_small_material(patch: pytest.MonkeyPatch) -> None:
         return calibrate(*given, **{**named, "options": few})
 
     patch.setattr(attacks.audit, "calibrate", fewer)
-    patch.setattr(wolves, "TARGETS", 40)
-    patch.setattr(wolves, "STARTS", 2)
 
 
 @pytest.fixture(scope="module")
@@ -75,8 +74,7 @@ def people(world: World, tmp_path_factory: pytest.TempPathFactory) -> Iterator[T
     asked: tuple[str | Path, ...] = (
         *("audit", "templates", root / "people", "--pack", world.pack, "--data-dir", world.data),
         *("--aligned", "--cache", root / "people.cache", "--victims", "20", "--owners", "100"),
-        *("--contract", world.data / "contract.json", "--no-learned"),
-        *("--climbed", "1", "--attempts", "50"),
+        *("--contract", world.data / "contract.json"),
     )
     populations: list[Population] = []
     beds: list[Testbed] = []
@@ -96,7 +94,7 @@ def people(world: World, tmp_path_factory: pytest.TempPathFactory) -> Iterator[T
         patch.setattr(attacks.audit, "draw_population", recorded_population)
         patch.setattr(attacks.audit, "audit_bed", recorded_bed)
         first = run(
-            *asked, "--no-comparison", "--max-success-with-key", "0",
+            *asked, "--no-comparison", "--limit", "success-with-key=0",
             "--out", root / "out", "--json",
         )  # fmt: skip
         assert "error: " not in first.stderr, first.stderr
@@ -113,9 +111,9 @@ def people_report(people: TemplateAudit) -> Any:
 def test_an_audit_of_templates_writes_report_and_figures(
     people: TemplateAudit, people_report: Any
 ) -> None:
-    files = ["report.json", "report.md", *both(["linkage", "oracle"]), "report.html"]
+    files = ["report.json", "report.md", *both(["oracle"]), "report.html"]
     assert sorted(file.name for file in people.out.iterdir()) == sorted(files)
-    are_pictures(people.out, ["linkage", "oracle"])
+    are_pictures(people.out, ["oracle"])
     said = people.first.json
     assert said.pop("notice") == DEMO_NOTICE
     assert said.pop("out") == str(people.out)
@@ -168,7 +166,7 @@ def test_what_two_attacks_found_becomes_report_verdict_and_status(
     monkeypatch.setattr(audit_templates, "run_audit", two_attacks)
     asked = (
         *("audit", "templates", world.people, "--pack", world.pack, "--data-dir", world.data),
-        *("--aligned", "--no-learned", "--victims", "20"),
+        *("--aligned", "--victims", "20"),
     )
     failed = run(*asked, "--out", tmp_path / "failed", "--json")
     assert failed.status == 1, failed.stderr
@@ -178,8 +176,7 @@ def test_what_two_attacks_found_becomes_report_verdict_and_status(
     (verdict,) = report["verdicts"]
     cells = {cell["limit"]: cell["status"] for cell in verdict["cells"]}
     assert cells["recovery-success"] == "fail"
-    most = [f"--max-{limit.name}=1" for limit in LIMITS if limit.name != "attribute-leakage"]
-    kept = run(*asked, *most, "--out", tmp_path / "kept")
+    kept = run(*asked, *WITHOUT_LIMITS, "--out", tmp_path / "kept")
     assert kept.status == 0, kept.stderr
     assert kept.stdout.startswith("PASSED\n")
 
@@ -190,7 +187,6 @@ def test_what_two_attacks_found_becomes_report_verdict_and_status(
         (["--dim", "3"], ((3,), "hybrid"), "auditing hybrid templates of m = 3"),
         (["--strategy", "random"], ((DIM,), "random"), f"auditing random templates of m = {DIM}"),
         ([], ((DIM,), "hybrid"), f"auditing hybrid templates of m = {DIM}"),
-        (["--dim", "3", "--strategy", "random", "--axes", "90"], ((3,), "random"), None),
     ],
 )
 def test_what_is_not_set_is_the_contracts(
@@ -218,9 +214,6 @@ def test_a_contract_that_cannot_be_read_stops_no_audit(
     assert found == ((DEFAULT_DIM,), "adversarial")
     assert said is not None
     assert said.startswith("not auditing as the contract")
-    # Where nothing of it is needed, nothing is said of it.
-    every = ("--dim", "3", "--strategy", "random", "--axes", "90")
-    assert planned(world, tmp_path, monkeypatch, *every) == (((3,), "random"), None)
 
 
 def planned(
@@ -236,7 +229,7 @@ def planned(
     monkeypatch.setattr(audit_templates, "run_audit", recorded)
     ran = run(
         *("audit", "templates", world.people, "--pack", world.pack, "--data-dir", world.data),
-        *("--aligned", "--no-learned", "--out", tmp_path / "out", *given),
+        *("--aligned", "--out", tmp_path / "out", *given),
     )
     (plan,) = plans
     lines = [line.removeprefix("note: ") for line in ran.stderr.splitlines() if "auditing" in line]
@@ -277,8 +270,7 @@ def test_an_attack_that_exceeds_its_limit_is_status_1(
 @pytest.fixture(scope="module")
 def compared(people: TemplateAudit) -> Ran:
     """The same beside decoys of real people, and with no limit."""
-    most = [f"--max-{limit.name}=1" for limit in LIMITS if limit.name != "attribute-leakage"]
-    return run(*people.asked, *most, "--out", people.root / "compared")
+    return run(*people.asked, *WITHOUT_LIMITS, "--out", people.root / "compared")
 
 
 @pytest.fixture(scope="module")
@@ -293,7 +285,7 @@ def test_the_seed_gives_the_outcomes_and_kept_limits_are_status_0(
 ) -> None:
     assert compared.status == 0
     assert compared.stdout.splitlines()[0] == "PASSED"
-    assert f"{people.root / 'compared'}: report.json, report.md, linkage.png" in compared.stdout
+    assert f"{people.root / 'compared'}: report.json, report.md, oracle.png" in compared.stdout
     found = [row for row in compared_report["outcomes"] if row["decoys"] == "generator"]
     assert found == people_report["outcomes"]
 

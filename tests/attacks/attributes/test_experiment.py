@@ -9,16 +9,13 @@ import pytest
 from attacks.attributes import experiment
 from attacks.attributes.experiment import run_scheme, trained_on
 from attacks.attributes.faces import Split
-from attacks.attributes.plan import AttributePlan, Setup, prepare, schemes_of
-from attacks.attributes.rows import AttributeRow, Leakage, strongest
-from attacks.errors import AuditError
-from attacks.outcomes import GENERATED, POOLED, RAW_SCHEME, KnowledgeLevel, Scheme
+from attacks.attributes.plan import AttributePlan, Setup, prepare
+from attacks.attributes.rows import AttributeRow, strongest
+from attacks.outcomes import GENERATED, POOLED, RAW_SCHEME, AuditError, KnowledgeLevel, Scheme
 from templates.decoys import DecoyGenerator
 from tests.attacks.attributes.people import faces
 
-PLAN = AttributePlan(
-    schemes=(), attributes=("gender", "race"), lifting=240, feature_ks=(10,), seed=5
-)
+PLAN = AttributePlan(schemes=(), lifting=240, feature_ks=(10,), seed=5)
 ADVERSARIAL = Scheme("adversarial", POOLED, 4)
 PLUS = Scheme("hybrid+", POOLED, 4)
 OURS = Scheme("adversarial", GENERATED, 4)
@@ -47,6 +44,10 @@ def attacked(scheme: Scheme, strength: float = 0.28) -> tuple[AttributeRow, ...]
     return tuple(run_scheme(setup(strength), scheme))
 
 
+def leaks(row: AttributeRow) -> bool:
+    return row.accuracy.ci_low > row.chance_of_predictions
+
+
 def by_attacker(scheme: Scheme) -> ByAttacker:
     return {(row.attacker, row.attribute): row for row in attacked(scheme)}
 
@@ -55,7 +56,6 @@ def by_attacker(scheme: Scheme) -> ByAttacker:
 def test_raw_embeddings_and_random_lifting_conceal_nothing(attacker: str, least: float) -> None:
     for scheme in (RAW_SCHEME, RANDOM):
         row = by_attacker(scheme)[attacker, "gender"]
-        assert row.leakage is Leakage.ABOVE
         assert row.accuracy.value > least
 
 
@@ -78,7 +78,7 @@ def test_trained_attackers_beat_the_papers_on_adversarial_lifting() -> None:
     for scheme in (ADVERSARIAL, OURS):
         rows = by_attacker(scheme)
         assert rows["logistic", "gender"].accuracy.value > rows["knn", "gender"].accuracy.value
-        assert rows["logistic", "gender"].leakage is Leakage.ABOVE
+        assert leaks(rows["logistic", "gender"])
 
 
 def test_an_attacker_with_the_pool_sees_through_adversarial_lifting() -> None:
@@ -94,8 +94,9 @@ def test_an_attacker_with_the_pool_sees_through_adversarial_lifting() -> None:
 
 def test_without_the_pool_the_rule_is_learnt_from_votes_below_chance() -> None:
     rows = by_attacker(PLUS)
-    assert rows["knn", "gender"].leakage is Leakage.BELOW
-    assert rows["logistic", "gender"].leakage is Leakage.ABOVE
+    neighbours = rows["knn", "gender"]
+    assert neighbours.accuracy.ci_high < neighbours.chance_of_predictions
+    assert leaks(rows["logistic", "gender"])
     turned = 1 - rows["knn", "gender"].accuracy.value
     assert rows["logistic", "gender"].accuracy.value > turned - 0.05
 
@@ -118,7 +119,7 @@ def test_decoys_that_are_spread_unlike_faces_point_at_the_embedding(
             for run in runs
         ]
         assert np.mean(margins) > more
-        assert all(run["second moments", attribute].leakage is Leakage.ABOVE for run in runs)
+        assert all(leaks(run["second moments", attribute]) for run in runs)
 
 
 def attacked_with_flat_decoys(scheme: Scheme, draw: int) -> ByAttacker:
@@ -132,7 +133,7 @@ def attacked_with_flat_decoys(scheme: Scheme, draw: int) -> ByAttacker:
 
 
 def test_tiles_change_nothing_but_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    some = prepare(SMALL, plan=replace(PLAN, trained=False))
+    some = prepare(SMALL, plan=PLAN)
     whole = run_scheme(some, RAW_SCHEME)
     monkeypatch.setattr(experiment, "_TILE_ROWS", 7)
     assert run_scheme(some, RAW_SCHEME) == whole
@@ -169,11 +170,6 @@ def test_no_part_of_the_attackers_faces_meets_itself() -> None:
     victims = {row.tobytes() for row in SMALL.attacked.embeddings}
     for part in (some.side.entries, some.side.gallery):
         assert not {row.tobytes() for row in part.embeddings} & victims
-
-
-def test_own_faces_are_lifted_as_often_as_training_allows() -> None:
-    plan = replace(PLAN, training_most=1000)
-    assert [plan.lifts_of(faces) for faces in (100, 400, 501, 4000)] == [3, 2, 1, 1]
 
 
 @pytest.mark.parametrize("scheme", [RAW_SCHEME, pytest.param(OURS, marks=LONG)], ids=str)
@@ -231,16 +227,10 @@ def test_a_trained_attacker_finds_a_rule_and_none_in_noise(
     assert set(said) | set(at_home) == {2}
 
 
-def test_the_default_grid_is_the_papers_and_ours() -> None:
-    schemes = schemes_of()
-    assert len(schemes) == len(set(schemes)) == 1 + 4 * 4 + 6
-    assert [s.dim for s in schemes if s.decoys == GENERATED] == [2, 4, 8, 16, 32, 64]
-
-
 def test_what_cannot_be_run_is_refused() -> None:
     small = Split(faces(60, seed=1), faces(40, seed=2), faces(30, seed=3))
     with pytest.raises(AuditError, match="neighbours are searched for"):
         prepare(small, plan=replace(PLAN, feature_ks=(50,)))
-    few = prepare(small, plan=replace(PLAN, trained=False))
+    few = prepare(small, plan=PLAN)
     with pytest.raises(AuditError, match="need a decoy generator"):
         run_scheme(few, OURS)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from attacks.attributes.faces import LabelledFaces, split
-from attacks.errors import AuditError
+from attacks.outcomes import AuditError
 from tests.attacks.attributes.people import CLASSES, faces
 
 TRAIN, VALIDATION = faces(60, seed=1), faces(20, seed=2)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from attacks.attributes.neighbours import METRICS, nearest_neighbours, vote, votes
-from attacks.errors import AuditError
+from attacks.outcomes import AuditError
 from templates.decoys import DecoyPool
 from templates.distances import Metric, Neighbours, pairwise_distances
 from templates.keys.randomness import Keystream
