@@ -1,4 +1,4 @@
-"""A package imports only from the layers below its own (docs/contributing.md)."""
+"""A package imports only from the layers below its own (CONTRIBUTING.md)."""
 
 import ast
 import re
@@ -117,7 +117,7 @@ def test_every_package_has_its_layer() -> None:
 
 
 def test_the_layers_are_those_of_the_page() -> None:
-    text = (ROOT / "docs" / "contributing.md").read_text(encoding="utf-8")
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| (\d) \| (.+?) \|", text, flags=re.MULTILINE)
     stated = {name: int(layer) for layer, names in rows for name in re.findall(r"`(\w+)/`", names)}
     assert stated == LAYERS

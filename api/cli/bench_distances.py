@@ -1,6 +1,6 @@
 """``veilface bench distances``: distances beside the matrix product that they cannot do without.
 
-A distance starts from the products of stacked rows (docs/contributing.md "Distances"). All
+A distance starts from the products of stacked rows (CONTRIBUTING.md, "Distances"). All
 of them in one matrix of its own is the *bare product*. The distances and the product are timed in
 turn, so that what else the machine does meets them alike, and compared repeat by repeat. Beside
 them stands the paper's formula as its authors compute it, on fewer pairs.
@@ -115,7 +115,7 @@ def distances(
         [
             Table(f"{count} × {count} distances in float32", COLUMNS, shown),
             f"Of {repeats} repeats: median times, and medians of their ratios (smallest to largest "
-            f"in brackets); {processors()} processors. docs/contributing.md says how to read it.",
+            f"in brackets); {processors()} processors. CONTRIBUTING.md says how to read it.",
         ],
     )
 
