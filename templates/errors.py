@@ -14,7 +14,6 @@
     ├── SealError                a ciphertext that does not open, or a key that cannot be used
     ├── StoreError
     │   ├── StoreUnavailable     the database does not answer
-    │   │   ├── DatabaseFileRemoved  its file is not the one that was opened
     │   │   └── StoreBusy        it answers, but this request not now
     │   │       └── Superseded   a decision on a template that was replaced or erased [12]
     │   ├── InvalidIdentifier    a subject id, tenant name or cursor that breaks the rules [1]
@@ -93,10 +92,6 @@ class StoreError(VeilfaceError):
 
 class StoreUnavailable(StoreError):
     """The database does not respond."""
-
-
-class DatabaseFileRemoved(StoreUnavailable):
-    """The path of the open database names another file, or none: what is written would be lost."""
 
 
 class StoreBusy(StoreUnavailable):

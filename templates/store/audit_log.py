@@ -19,7 +19,7 @@ from typing import Any
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
-from templates.errors import StoreBusy, StoreError
+from templates.errors import StoreError
 from templates.keys.sealing import encode_parts
 from templates.store.audit_chain import (
     LINES,
@@ -311,15 +311,24 @@ class AuditLog:
         lines = [_line(row) for row in rows[:limit]]
         return lines, lines[-1].sequence if len(rows) > limit else None
 
-    def verify(
+    def verify(self, *, anchor: Anchor | None = None, batch: int = BATCH) -> Verification:
+        """Walk over the whole chain, of one moment, beside a service in use; see :meth:`walk`."""
+        key = self.key
+        return self._database.snapshot(
+            lambda connection: self.walk(connection, key, anchor=anchor, batch=batch)
+        )
+
+    def walk(
         self,
+        connection: Connection,
+        key: bytes,
         *,
         anchor: Anchor | None = None,
         seen: Callable[[Mapping[str, Any]], None] | None = None,
         progress: Callable[[int], None] | None = None,
         batch: int = BATCH,
     ) -> Verification:
-        """Walk over the whole chain beside a service in use, up to the first break.
+        """Walk over the whole chain, up to the first break, in a snapshot.
 
         Parameters
         ----------
@@ -331,29 +340,15 @@ class AuditLog:
             Called after each batch with the number of its lines.
         batch
             Lines read at once, and in memory.
-
-        Raises
-        ------
-        SealError
-            If the master key is not the one that the log was written with.
         """
-        key = self.key
         try:
-            base = self._database.read(lambda connection: read_head(connection, key)).base
+            head = read_head(connection, key)
         except BrokenAuditLog:
             return Verification(0, START, Problem(0, "head does not match"))
-        last, count, is_anchored = base, 0, anchor in (None, base)
-        while True:
-            # The head first: a line that comes between the two reads is not beyond the head.
-            head, rows = self._database.read(
-                lambda connection, after=last.sequence: (  # type: ignore[misc]
-                    read_head(connection, key),
-                    # From the very first row: one that was slipped in before the base is seen too.
-                    rows_after(connection, None if after == base.sequence else after, batch),
-                )
-            )
-            if head.base != base:
-                raise StoreBusy("lines were archived meanwhile: verify the log again")
+        last, count, is_anchored = head.base, 0, anchor in (None, head.base)
+        # From the very first row: one that was slipped in before the base is seen too.
+        after = None
+        while rows := rows_after(connection, after, batch):
             for row in rows:
                 values = row._mapping
                 if what := line_break(key, values, last):
@@ -363,10 +358,9 @@ class AuditLog:
                 is_anchored |= last == anchor
                 if seen is not None:
                     seen(values)
-            if progress is not None and rows:
+            after = last.sequence
+            if progress is not None:
                 progress(len(rows))
-            if not rows:
-                break
         if head.last != last:
             missing = head.last.sequence > last.sequence
             what = "missing" if missing else "head does not match"
@@ -374,14 +368,6 @@ class AuditLog:
         if not is_anchored and anchor is not None:
             return Verification(count, last, Problem(anchor.sequence, "anchor not in chain"))
         return Verification(count, last, None)
-
-    def lines_after(self, connection: Connection, last: Anchor) -> Iterator[Mapping[str, Any]]:
-        """Columns of the lines after the last one of a walk, up to the first break."""
-        for row in rows_after(connection, last.sequence):
-            if line_break(self.key, row._mapping, last):
-                return
-            last = Anchor(row.sequence, row.mac)
-            yield row._mapping
 
     def __repr__(self) -> str:
         return "AuditLog()"

@@ -11,7 +11,6 @@ import sqlite3
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
 from typing import Any, TypeVar
 
 import sqlalchemy as sa
@@ -19,7 +18,7 @@ from sqlalchemy.engine import Connection, Engine
 from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 
-from templates.errors import DatabaseFileRemoved, StoreBusy, StoreError, StoreUnavailable
+from templates.errors import StoreBusy, StoreError, StoreUnavailable
 from templates.store.engine import checked_url, make_engine, sqlite_file
 from templates.store.turn import next_in_line
 
@@ -86,10 +85,6 @@ class Database:
         self._readers = self.engine
         if not self.is_sqlite:
             self._readers = self.engine.execution_options(isolation_level="AUTOCOMMIT")
-        self._opened = _identity(self._file)
-        if self.is_sqlite:
-            # SQLite would make an empty file, and the connection would stay with that one.
-            sa.event.listen(self.engine, "do_connect", lambda *_: self._require_file())
 
     def read(self, work: Callable[[Connection], T]) -> T:
         """Run `work` on a connection; what it sees is committed.
@@ -112,7 +107,6 @@ class Database:
         with _translating(), engine.connect() as connection:
             if self.is_sqlite:
                 _driver(connection).execute("BEGIN")
-                self._require_file()
             return work(connection)
 
     def write(self, work: Callable[[Connection], T], *, wait: float | None = None) -> T:
@@ -143,7 +137,6 @@ class Database:
             if self.is_sqlite:
                 with self._turn(until), self._patience(connection, until) as driver:
                     driver.execute("BEGIN IMMEDIATE")
-                self._require_file()
             else:
                 connection.execute(_BEGIN_WRITE, {"limit": str(round(1000 * wait))})
             return work(connection)
@@ -221,31 +214,8 @@ class Database:
         finally:
             driver.execute(_busy_timeout(self._timeout))
 
-    def _require_file(self) -> None:
-        """Refuse to go on with a file that was removed: its writes would be gone with it.
-
-        Raises
-        ------
-        DatabaseFileRemoved
-        """
-        if _identity(self._file) != self._opened:
-            raise DatabaseFileRemoved(
-                "the database file was removed or replaced while it was open: put it back, or stop "
-                "the service first and start it again"
-            )
-
     def __repr__(self) -> str:
         return f"Database({self.url.render_as_string(hide_password=True)!r})"
-
-
-def _identity(file: Path | None) -> tuple[int, int] | None:
-    if file is None:
-        return None
-    try:
-        status = file.stat()
-    except OSError:
-        return None
-    return status.st_dev, status.st_ino
 
 
 def _busy_timeout(seconds: float) -> str:

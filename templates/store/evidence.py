@@ -101,35 +101,26 @@ def verify_log_and_records(
     anchor: Anchor | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> tuple[Verification, tuple[RecordProblem, ...]]:
-    """Walk over the audit log, and hold rows against what it tells.
+    """Walk over the audit log, and hold rows of the same moment against what it tells.
 
-    Parameters
-    ----------
-    anchor, progress
-        As of :meth:`AuditLog.verify`.
-
-    Returns
-    -------
-    The walk, and the rows that contradict it. Rows are looked at only where the log is whole. What
-    lines in an archive tell is not known.
+    Rows are looked at only where the log is whole. What lines in an archive tell is not known.
     """
-    findings = LogFindings()
-    verification = context.audit_log.verify(anchor=anchor, seen=findings.read, progress=progress)
-    if not verification.intact:
-        return verification, ()
+    findings, key = LogFindings(), context.audit_log.key
 
-    def work(connection: Connection) -> tuple[RecordProblem, ...]:
-        # Lines and rows of one moment.
-        for line in context.audit_log.lines_after(connection, verification.head):
-            findings.read(line)
-        return (
+    def work(connection: Connection) -> tuple[Verification, tuple[RecordProblem, ...]]:
+        verification = context.audit_log.walk(
+            connection, key, anchor=anchor, seen=findings.read, progress=progress
+        )
+        if not verification.intact:
+            return verification, ()
+        return verification, (
             *_keys(findings, api_keys, connection),
             *_tenants(findings, connection),
             *_enrollments(findings, context, connection),
             *_counts(findings, context, connection),
         )
 
-    return verification, context.database.snapshot(work)
+    return context.database.snapshot(work)
 
 
 def _keys(findings: LogFindings, api_keys: ApiKeys, connection: Connection) -> list[RecordProblem]:

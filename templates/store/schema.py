@@ -6,10 +6,10 @@ Receipts and audit lines outlive a subject: they name it by a keyed pseudonym on
 """
 
 from datetime import UTC, datetime
+from typing import Annotated, Any, ClassVar
 
 from sqlalchemy import (
     BigInteger,
-    Boolean,
     DateTime,
     Dialect,
     ForeignKey,
@@ -25,14 +25,17 @@ from sqlalchemy import (
 )
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
-KEY_ID = String(16)
 PSEUDONYM = String(64)
 UUID_HEX = String(32)
 
 # Ordered by code point on every database, so that a page cursor means the same on each of them.
 SUBJECT_ID = String(128).with_variant(String(128, collation="C"), "postgresql")
 SERIAL = BigInteger().with_variant(Integer, "sqlite")
-MAC = LargeBinary(32)
+
+RowId = Annotated[str, mapped_column(UUID_HEX, primary_key=True)]
+TenantId = Annotated[str, mapped_column(UUID_HEX, ForeignKey("tenants.id", ondelete="CASCADE"))]
+KeyId = Annotated[str, mapped_column(String(16))]
+Mac = Annotated[bytes, mapped_column(LargeBinary(32))]
 
 
 class UtcDateTime(TypeDecorator[datetime]):
@@ -41,11 +44,7 @@ class UtcDateTime(TypeDecorator[datetime]):
     impl = DateTime(timezone=True)
     cache_ok = True
 
-    def process_bind_param(
-        self,
-        value: datetime | None,
-        dialect: Dialect,  # noqa: ARG002 - SQLAlchemy's signature
-    ) -> datetime | None:
+    def process_bind_param(self, value: datetime | None, dialect: Dialect) -> datetime | None:  # noqa: ARG002
         """Convert to UTC; a naive time has no meaning here."""
         if value is None:
             return None
@@ -53,11 +52,7 @@ class UtcDateTime(TypeDecorator[datetime]):
             raise ValueError("times in the store carry a time zone")
         return value.astimezone(UTC)
 
-    def process_result_value(
-        self,
-        value: datetime | None,
-        dialect: Dialect,  # noqa: ARG002
-    ) -> datetime | None:
+    def process_result_value(self, value: datetime | None, dialect: Dialect) -> datetime | None:  # noqa: ARG002
         """Attach UTC where the database dropped the zone."""
         if value is None:
             return None
@@ -67,6 +62,7 @@ class UtcDateTime(TypeDecorator[datetime]):
 class Base(DeclarativeBase):
     """Base of the mapped tables; constraint names are fixed so that migrations can name them."""
 
+    type_annotation_map: ClassVar[dict[Any, Any]] = {datetime: UtcDateTime}
     metadata = MetaData(
         naming_convention={
             "ix": "ix_%(table_name)s_%(column_0_N_name)s",
@@ -82,11 +78,11 @@ class TenantRow(Base):
 
     __tablename__ = "tenants"
 
-    id: Mapped[str] = mapped_column(UUID_HEX, primary_key=True)
+    id: Mapped[RowId]
     name: Mapped[str] = mapped_column(String(64), unique=True)
-    rotation_epoch: Mapped[int] = mapped_column(Integer)
-    created_at: Mapped[datetime] = mapped_column(UtcDateTime)
-    template_enrollment: Mapped[bool] = mapped_column(Boolean, server_default=false())
+    rotation_epoch: Mapped[int]
+    created_at: Mapped[datetime]
+    template_enrollment: Mapped[bool] = mapped_column(server_default=false())
 
 
 class RotationKeyRow(Base):
@@ -94,13 +90,11 @@ class RotationKeyRow(Base):
 
     __tablename__ = "rotation_keys"
 
-    tenant_id: Mapped[str] = mapped_column(
-        UUID_HEX, ForeignKey("tenants.id", ondelete="CASCADE"), primary_key=True
-    )
-    epoch: Mapped[int] = mapped_column(Integer, primary_key=True)
-    wrapped_key: Mapped[bytes] = mapped_column(LargeBinary)
-    wrapping_key: Mapped[str] = mapped_column(KEY_ID)
-    created_at: Mapped[datetime] = mapped_column(UtcDateTime)
+    tenant_id: Mapped[TenantId] = mapped_column(primary_key=True)
+    epoch: Mapped[int] = mapped_column(primary_key=True)
+    wrapped_key: Mapped[bytes]
+    wrapping_key: Mapped[KeyId]
+    created_at: Mapped[datetime]
 
 
 class ApiKeyRow(Base):
@@ -108,20 +102,18 @@ class ApiKeyRow(Base):
 
     __tablename__ = "api_keys"
 
-    id: Mapped[str] = mapped_column(UUID_HEX, primary_key=True)
-    tenant_id: Mapped[str] = mapped_column(
-        UUID_HEX, ForeignKey("tenants.id", ondelete="CASCADE"), index=True
-    )
+    id: Mapped[RowId]
+    tenant_id: Mapped[TenantId] = mapped_column(index=True)
     prefix: Mapped[str] = mapped_column(String(16), unique=True)
     token_hash: Mapped[bytes] = mapped_column(LargeBinary(32))
     rights: Mapped[str] = mapped_column(String(128))
     label: Mapped[str] = mapped_column(String(128))
-    created_at: Mapped[datetime] = mapped_column(UtcDateTime)
-    expires_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
-    revoked_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
-    last_used_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
+    created_at: Mapped[datetime]
+    expires_at: Mapped[datetime | None]
+    revoked_at: Mapped[datetime | None]
+    last_used_at: Mapped[datetime | None]
     lowest_level: Mapped[str | None] = mapped_column(String(64))
-    mac: Mapped[bytes] = mapped_column(MAC)
+    mac: Mapped[Mac]
 
 
 class SubjectRow(Base):
@@ -134,14 +126,14 @@ class SubjectRow(Base):
         Index("ix_subjects_updated_at", "updated_at"),
     )
 
-    id: Mapped[str] = mapped_column(UUID_HEX, primary_key=True)
-    tenant_id: Mapped[str] = mapped_column(UUID_HEX, ForeignKey("tenants.id", ondelete="CASCADE"))
+    id: Mapped[RowId]
+    tenant_id: Mapped[TenantId]
     subject_id: Mapped[str] = mapped_column(SUBJECT_ID)
-    wrapped_key: Mapped[bytes] = mapped_column(LargeBinary)
-    wrapping_key: Mapped[str] = mapped_column(KEY_ID)
-    created_at: Mapped[datetime] = mapped_column(UtcDateTime)
-    updated_at: Mapped[datetime] = mapped_column(UtcDateTime)
-    last_used_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
+    wrapped_key: Mapped[bytes]
+    wrapping_key: Mapped[KeyId]
+    created_at: Mapped[datetime]
+    updated_at: Mapped[datetime]
+    last_used_at: Mapped[datetime | None]
 
 
 class TemplateRow(Base):
@@ -157,15 +149,15 @@ class TemplateRow(Base):
     )
     template_id: Mapped[str] = mapped_column(String(64))
     contract_id: Mapped[str] = mapped_column(String(64), index=True)
-    rotation_epoch: Mapped[int] = mapped_column(Integer)
-    ciphertext: Mapped[bytes] = mapped_column(LargeBinary)
-    n: Mapped[int] = mapped_column(Integer)
-    m: Mapped[int] = mapped_column(Integer)
+    rotation_epoch: Mapped[int]
+    ciphertext: Mapped[bytes]
+    n: Mapped[int]
+    m: Mapped[int]
     dtype: Mapped[str] = mapped_column(String(16))
     source: Mapped[str] = mapped_column(String(16))
-    photos: Mapped[int] = mapped_column(Integer)
+    photos: Mapped[int]
     holder_salt: Mapped[str | None] = mapped_column(UUID_HEX)
-    created_at: Mapped[datetime] = mapped_column(UtcDateTime)
+    created_at: Mapped[datetime]
 
 
 class FailedAttemptsRow(Base):
@@ -173,13 +165,11 @@ class FailedAttemptsRow(Base):
 
     __tablename__ = "failed_attempts"
 
-    tenant_id: Mapped[str] = mapped_column(
-        UUID_HEX, ForeignKey("tenants.id", ondelete="CASCADE"), primary_key=True
-    )
+    tenant_id: Mapped[TenantId] = mapped_column(primary_key=True)
     pseudonym: Mapped[str] = mapped_column(PSEUDONYM, primary_key=True)
-    consecutive: Mapped[int] = mapped_column(Integer)
-    total: Mapped[int] = mapped_column(Integer)
-    last_failed_at: Mapped[datetime] = mapped_column(UtcDateTime, index=True)
+    consecutive: Mapped[int]
+    total: Mapped[int]
+    last_failed_at: Mapped[datetime] = mapped_column(index=True)
 
 
 class ReceiptRow(Base):
@@ -192,7 +182,7 @@ class ReceiptRow(Base):
     pseudonym: Mapped[str] = mapped_column(PSEUDONYM)
     body: Mapped[str] = mapped_column(Text)
     signature: Mapped[bytes] = mapped_column(LargeBinary(64))
-    created_at: Mapped[datetime] = mapped_column(UtcDateTime)
+    created_at: Mapped[datetime]
 
 
 class AuditRow(Base):
@@ -218,7 +208,7 @@ class AuditRow(Base):
     request_id: Mapped[str | None] = mapped_column(String(64))
     detail: Mapped[str | None] = mapped_column(String(64))
     token: Mapped[str | None] = mapped_column(String(64), unique=True)
-    mac: Mapped[bytes] = mapped_column(MAC)
+    mac: Mapped[Mac]
 
 
 class AuditHeadRow(Base):
@@ -230,12 +220,12 @@ class AuditHeadRow(Base):
 
     __tablename__ = "audit_head"
 
-    id: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=False)
+    id: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
     base_sequence: Mapped[int] = mapped_column(SERIAL)
-    base_mac: Mapped[bytes] = mapped_column(MAC)
+    base_mac: Mapped[Mac]
     sequence: Mapped[int] = mapped_column(SERIAL)
-    line_mac: Mapped[bytes] = mapped_column(MAC)
-    mac: Mapped[bytes] = mapped_column(MAC)
+    line_mac: Mapped[Mac]
+    mac: Mapped[Mac]
 
 
 class SecretRow(Base):
@@ -244,6 +234,6 @@ class SecretRow(Base):
     __tablename__ = "secrets"
 
     name: Mapped[str] = mapped_column(String(64), primary_key=True)
-    wrapped_value: Mapped[bytes] = mapped_column(LargeBinary)
-    wrapping_key: Mapped[str] = mapped_column(KEY_ID)
-    created_at: Mapped[datetime] = mapped_column(UtcDateTime)
+    wrapped_value: Mapped[bytes]
+    wrapping_key: Mapped[KeyId]
+    created_at: Mapped[datetime]

@@ -258,24 +258,6 @@ def test_a_write_waits_for_other_processes_once_and_not_for_each_of_their_locks(
     store.close()
 
 
-def test_nothing_is_written_to_a_file_that_was_removed(
-    tmp_path: Path, keyring: MasterKeyring
-) -> None:
-    path, aside = tmp_path / "veilface.db", tmp_path / "aside.db"
-    store = TemplateStore(f"sqlite:///{path}", keyring)
-    store.upgrade()
-    path.rename(aside)
-    for replaced in (False, True):
-        if replaced:
-            path.touch()
-        for work in (store.ping, lambda: store.tenants.create("default")):
-            with pytest.raises(StoreUnavailable, match="removed or replaced"):
-                work()
-    aside.rename(path)
-    assert store.tenants.create("default")
-    store.close()
-
-
 def test_a_write_waits_for_one_that_hangs_no_longer_than_the_timeout(
     postgres_url: str, keyring: MasterKeyring
 ) -> None:
