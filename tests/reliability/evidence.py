@@ -108,29 +108,6 @@ def examine(asked: Asked, subjects: Sequence[str]) -> Examined:
         store.close()
 
 
-@dataclass
-class _Left:
-    """What a write has left, and the moments between which it may have been seen.
-
-    Attributes
-    ----------
-    since
-        When the write was sent; ``until`` is when the next one was over.
-    """
-
-    since: float
-    enrolled: Operation | None
-    until: float = math.inf
-
-    def is_seen_as(self, template_id: str | None, told: set[str | None]) -> bool:
-        """Whether a description of it shows this template; None where nobody is enrolled."""
-        if self.enrolled is None or template_id is None:
-            return self.enrolled is None and template_id is None
-        if self.enrolled.template_id is None:  # nobody was answered which
-            return template_id not in told
-        return template_id == self.enrolled.template_id
-
-
 class _Examination:
     def __init__(
         self,
@@ -319,7 +296,6 @@ class _Examination:
         enrolled: Operation | None = None
         receipt: str | None = None
         known = True  # the receipt: not where its erasure had no answer
-        left = [_Left(-math.inf, None)]
         for each in self._operations(self._lines_of(subject)):
             well = each.answered_well
             if each.kind == "describe":
@@ -340,34 +316,6 @@ class _Examination:
                 enrolled, receipt, known = None, each.receipt_id if well else None, well
             else:
                 enrolled = each
-            left[-1].until = each.over
-            left.append(_Left(max(left[-1].since, each.started), enrolled))
-        self._described(subject, left)
-
-    def _described(self, subject: str, left: Sequence["_Left"]) -> None:
-        """A description saw what was left at a moment of its own, which no line tells.
-
-        One that was sent after another one's answer saw the same, or something later.
-        """
-        enrollments = [each for each in self.history if each.kind == "enroll"]
-        told = {each.template_id for each in enrollments if each.answered_well}
-        seen: list[tuple[float, int]] = []
-        for each in sorted(self.history, key=lambda one: one.started):
-            if each.kind != "describe" or each.subject != subject or not each.answered_well:
-                continue
-            first = max((place for answered, place in seen if answered < each.started), default=0)
-            places = [
-                place
-                for place, one in enumerate(left)
-                if place >= first
-                and one.since <= each.answered
-                and one.until >= each.started
-                and one.is_seen_as(each.template_id, told)
-            ]
-            if not places:
-                self._wrong(f"{subject}: no serial order: {each}")
-                continue
-            seen.append((each.answered, places[0]))
 
     def _operations(self, lines: Sequence[Line]) -> list[Operation]:
         """The clients' operations of some lines, in the order of these."""

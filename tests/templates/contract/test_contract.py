@@ -2,12 +2,10 @@
 
 import base64
 import dataclasses
-import errno
 import functools
 import hashlib
 import json
 import os
-import stat
 from pathlib import Path
 from typing import Any
 
@@ -139,23 +137,6 @@ def test_contract_id_is_the_hash_of_the_canonical_json() -> None:
     assert make_binding(preprocessing=preprocessing) == make_binding()
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"embedder_sha256": "ac" * 32},
-        {"preprocessing": {"size": 112, "mean": (127.5, 127.5, 127.5), "flip": True}},
-        {"n": 17},
-        {"axes": 15},
-        {"strategy": Strategy.HYBRID},
-        {"m": 4},
-        {"decoy_source_id": "ce" * 32},
-    ],
-    ids=lambda changes: next(iter(changes)),
-)
-def test_every_part_of_the_binding_changes_the_id(changes: dict[str, Any]) -> None:
-    assert make_binding(**changes).contract_id != make_binding().contract_id
-
-
 def test_recalibrating_keeps_the_contract_id_and_changes_the_calibration_id() -> None:
     first = make_contract()
     levels = (Level("fmr-1e-2", 1e-2, 2.1, RATE, RATE),)
@@ -175,19 +156,6 @@ def test_canonical_json_agrees_with_sorted_compact_json() -> None:
     for broken in (float("nan"), float("inf"), "\ud800", object(), b"x", {1: 2}, deep):
         with pytest.raises(ContractError):
             canonical_json({"x": broken})
-
-
-def test_the_embedding_id_names_the_weights_and_the_preprocessing() -> None:
-    binding = make_binding()
-    text = json.dumps(
-        {"embedder_sha256": "ab" * 32, "preprocessing": dict(binding.preprocessing)},
-        sort_keys=True,
-        separators=(",", ":"),
-    )
-    assert binding.embedding_id == hashlib.sha256(text.encode()).hexdigest()
-    assert make_binding(m=2).embedding_id == binding.embedding_id
-    assert make_binding(preprocessing={"flip": 1}).embedding_id != binding.embedding_id
-    assert make_binding(embedder_sha256="ef" * 32).embedding_id != binding.embedding_id
 
 
 # --- values --------------------------------------------------------------------------------
@@ -348,29 +316,6 @@ def test_a_file_keeps_everything(tmp_path: Path, changes: dict[str, Any]) -> Non
     assert not {"groups", "frr_by_photos"} & plain.keys()
 
 
-def test_the_file_is_private_and_alone(tmp_path: Path) -> None:
-    path = saved(tmp_path)
-    saved(tmp_path)
-    assert stat.S_IMODE(path.stat().st_mode) == 0o600
-    assert [entry.name for entry in tmp_path.iterdir()] == ["contract.json"]
-
-
-def test_a_failed_write_leaves_the_old_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = saved(tmp_path)
-    before = path.read_bytes()
-
-    def fail(_: int) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr("os.fsync", fail)
-    with pytest.raises(OSError, match="No space left"):
-        make_contract(photo_consistency=0.5).save(path, SEALER)
-    assert path.read_bytes() == before
-    assert len(list(tmp_path.iterdir())) == 1
-
-
 def test_the_seed_of_the_cohort_is_sealed_and_never_public(tmp_path: Path) -> None:
     contract = make_contract()
     text = saved(tmp_path, contract).read_bytes()
@@ -430,17 +375,6 @@ def test_another_kind_of_file_is_refused(tmp_path: Path, key: str, value: Any) -
 def test_a_value_of_another_type_or_range_is_refused(changes: dict[str, Any], reason: str) -> None:
     with pytest.raises(ContractError, match=reason):
         Contract.from_json(make_contract().to_json() | changes, cohort_seed="00" * 32)
-
-
-def test_a_sealed_part_that_is_no_such_part_is_refused(tmp_path: Path) -> None:
-    path = saved(tmp_path)
-    document = json.loads(path.read_text())
-    sealed = document.pop("sealed")
-    context = contract_module._seal_context(document)
-    good = SEALER.open(base64.b64decode(sealed), context=context)
-    text = base64.b64encode(SEALER.seal(good[:-1], context=context)).decode()
-    with pytest.raises(ContractError, match="32 bytes"):
-        reloaded(path, document | {"sealed": text})
 
 
 json_values = st.recursive(

@@ -4,8 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 from sklearn.linear_model import LogisticRegression
 
@@ -233,35 +231,6 @@ def test_save_and_load(fitted: DecoyGenerator, tmp_path: Path) -> None:
     loaded = load_source(path, sealer)
     assert isinstance(loaded, DecoyGenerator)
     assert loaded.source_id == fitted.source_id
-
-
-def test_every_single_byte_flip_is_refused_or_gives_a_working_generator() -> None:
-    generator = DecoyGenerator.fit(face_like(200, seed=1, n=4))
-    data = generator.to_bytes()
-    header = 8 + int.from_bytes(data[:8], "little")
-    accepted = 0
-    for position in range(len(data)):
-        broken = bytearray(data)
-        broken[position] ^= 0xFF
-        try:
-            other = DecoyGenerator.from_bytes(bytes(broken))
-        except DecoyError:
-            continue
-        assert position >= header
-        assert other.source_id != generator.source_id
-        assert other.to_bytes() == bytes(broken)
-        accepted += 1
-    assert accepted > 0
-
-
-@given(cut=st.floats(0, 1, exclude_max=True), tail=st.binary(max_size=20))
-@settings(max_examples=100)
-def test_truncated_or_longer_bytes_are_refused(cut: float, tail: bytes) -> None:
-    data = DecoyGenerator.fit(face_like(200, seed=1, n=4)).to_bytes()
-    with pytest.raises(DecoyError):
-        DecoyGenerator.from_bytes(data[: int(cut * len(data))] + tail)
-    with pytest.raises(DecoyError):
-        DecoyGenerator.from_bytes(data + b"\0" + tail)
 
 
 def with_header(header: bytes, body: bytes = b"") -> bytes:

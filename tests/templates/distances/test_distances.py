@@ -154,39 +154,6 @@ def test_a_member_is_at_distance_zero(metric: str, name: str):
     assert seen.max() < (1e-6 if metric == "euclidean" else 2e-4)
 
 
-def dual_distance(p: np.ndarray, d: np.ndarray, q: np.ndarray, e: np.ndarray) -> float:
-    """Distance by hyperplanes (supplement A): 3n − 2m unknowns, the closest point and multipliers.
-
-    A set of directions (0, n) is a point.
-    """
-    n = len(p)
-    own, others = (scipy.linalg.null_space(rows).T if len(rows) else np.eye(n) for rows in (d, e))
-    system = np.block(
-        [
-            [own, np.zeros((len(own), len(own) + len(others)))],
-            [others, np.zeros((len(others), len(own))), np.eye(len(others))],
-            [np.zeros((n, n)), own.T, -others.T],
-        ]
-    )
-    right_side = np.concatenate([own @ p, others @ q, np.zeros(n)])
-    multipliers = np.linalg.lstsq(system, right_side, rcond=None)[0][n + len(own) :]
-    return float(np.linalg.norm(multipliers @ others))
-
-
-@settings(max_examples=30)
-@given(n=st.integers(6, 24), dims=st.tuples(st.floats(0, 1), st.floats(0, 1)), seed=st.integers(0))
-def test_the_specification_agrees_with_the_dual_form(n: int, dims: tuple, seed: int):
-    m, k = (1 + int(part * (n // 2 - 2)) for part in dims)  # where the dual is not singular
-    a, b = randoms(1, m, seed=seed, n=n), randoms(1, k, seed=seed + 1, n=n)
-    (p, d), (q, e) = ((x.foot.astype(np.float64), x.basis.astype(np.float64)) for x in (a, b))
-    seen = matrix("exact", a, b, metric="euclidean")[0, 0]
-    assert seen == pytest.approx(dual_distance(p, d, q, e), rel=1e-9, abs=1e-9)
-    point = units(Keystream.seeded(seed), 1, n)
-    seen = matrix("exact", point, b, metric="euclidean")[0, 0]
-    expected = dual_distance(point[0], np.empty((0, n)), q, e)
-    assert seen == pytest.approx(expected, rel=1e-9, abs=1e-9)
-
-
 # --- the two in float32 against float64 --------------------------------------------------------
 
 

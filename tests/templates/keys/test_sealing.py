@@ -3,7 +3,6 @@ import hashlib
 import hmac
 import os
 import pickle
-import threading
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -118,28 +117,6 @@ def test_an_existing_file_is_never_overwritten(tmp_path: Path) -> None:
     with pytest.raises(SealError, match="exists already"):
         MasterKeyring.create(path)
     assert path.read_bytes() == b"precious\n"
-
-
-def test_of_many_creators_exactly_one_succeeds(tmp_path: Path) -> None:
-    made: list[str] = []
-    refused: list[SealError] = []
-    start = threading.Barrier(8)
-
-    def create() -> None:
-        start.wait()
-        try:
-            made.append(MasterKeyring.create(tmp_path / "key").current)
-        except SealError as error:
-            refused.append(error)
-
-    threads = [threading.Thread(target=create) for _ in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert len(made) == 1
-    assert len(refused) == 7
-    assert MasterKeyring.load(tmp_path / "key").current == made[0]
 
 
 @pytest.mark.parametrize("mode", [0o640, 0o604, 0o660, 0o610, 0o777])

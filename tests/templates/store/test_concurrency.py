@@ -16,7 +16,6 @@ import pytest
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
-from templates.keys.sealing import MasterKeyring
 from templates.store import TemplateStore
 from templates.store.database import Database
 from templates.store.schema import ReceiptRow, SubjectRow, TemplateRow
@@ -113,31 +112,6 @@ def assert_equal_to_a_serial_order(store: TemplateStore, done: Counter[str]) -> 
     held = sa.select(sa.func.count()).where(ReceiptRow.body.contains('"held":true'))
     receipts = store.database.read(lambda each: each.execute(held).scalar_one())
     assert receipts == sum(done[f"erased {subject}"] for subject in SUBJECTS)
-
-
-def test_threads_on_the_same_subjects(
-    store: TemplateStore, database_url: str, key_file: Path
-) -> None:
-    stores = [store, TemplateStore(database_url, MasterKeyring.load(key_file))]
-    counts: list[Counter[str]] = []
-    errors: list[BaseException] = []
-
-    def use(seed: int) -> None:
-        try:
-            counts.append(mix(stores[seed % 2], seed, 40))
-        except BaseException as error:
-            errors.append(error)
-
-    threads = [threading.Thread(target=use, args=(seed,)) for seed in range(6)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert errors == []
-    done = sum(counts, Counter[str]())
-    assert done["read"] > 0
-    assert_equal_to_a_serial_order(store, done)
-    stores[1].close()
 
 
 def test_processes_on_the_same_subjects(store: TemplateStore) -> None:

@@ -184,27 +184,6 @@ def test_the_server_gives_up_a_host_that_is_cut_off_or_stopped(
     assert settings(postgres_database).items() >= {**bounds, "work_mem": "5000"}.items()
 
 
-def test_a_process_that_stops_inside_a_write_lets_go_of_its_locks(
-    postgres_url: str, keyring: MasterKeyring
-) -> None:
-    store = TemplateStore(postgres_url, keyring)
-    store.upgrade()
-    store.tenants.create("kept")
-    stopping = Database(with_options(postgres_url, "-c idle_in_transaction_session_timeout=50"))
-
-    def stop(connection: sa.Connection) -> None:
-        connection.execute(sa.delete(TenantRow))
-        # Waits until the server has ended the session of this write.
-        store.database.write(lambda _: None, wait=0)
-        connection.execute(sa.select(1))
-
-    with pytest.raises(StoreUnavailable, match="does not answer"):
-        stopping.write(stop)
-    assert [tenant.name for tenant in store.tenants.all()] == ["kept"]
-    stopping.close()
-    store.close()
-
-
 def test_a_busy_sqlite_file_is_store_unavailable(tmp_path: Path, keyring: MasterKeyring) -> None:
     path = tmp_path / "veilface.db"
     store = TemplateStore(f"sqlite:///{path}", keyring, timeout=0.2)

@@ -1,4 +1,3 @@
-import logging
 import threading
 
 import pytest
@@ -89,15 +88,6 @@ def test_a_query_before_the_upgrade_names_the_remedy(
     with pytest.raises(StoreError, match="veilface db upgrade"):
         store.subjects.get("default", "ada")
     store.close()
-
-
-def test_migrating_leaves_logging_alone(database_url: str) -> None:
-    level, handlers = logging.root.level, list(logging.root.handlers)
-    database = Database(database_url)
-    migrate.upgrade(database)
-    assert (logging.root.level, logging.root.handlers) == (level, handlers)
-    assert not logging.getLogger("templates").disabled
-    database.close()
 
 
 def test_files_are_named_by_their_revisions() -> None:
