@@ -207,7 +207,7 @@ def rotate_tenant(
         if binding is not None:
             with progress("turning templates", rotations.remaining(tenant)) as advance:
                 moved = rotations.move(tenant, binding, by=operator(), progress=advance)
-        left = list(rotations.subjects_of_old_epochs(tenant))
+        left = rotations.subjects_of_old_epochs(tenant)
         dropped = 0 if left else rotations.retire(tenant, by=operator())
     text = [f"Tenant {tenant} is in rotation epoch {epoch}; {moved} templates were turned into it."]
     if left:

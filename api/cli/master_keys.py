@@ -109,7 +109,7 @@ def renew(
         enroll_again = {}
         for tenant in store.tenants.all():
             store.rerotation.begin(tenant.name, by=operator())
-            enroll_again[tenant.name] = list(store.rerotation.subjects_of_old_epochs(tenant.name))
+            enroll_again[tenant.name] = store.rerotation.subjects_of_old_epochs(tenant.name)
         api_keys = [key.prefix for key in store.api_keys.all() if key.is_valid_at(utc_now())]
         anchor = str(store.audit_log.head())
     text = [

@@ -55,8 +55,8 @@ _DEVICE: ContextVar[str | None] = ContextVar("device", default=None)
 def on_device(device: str | None) -> Iterator[None]:
     """Compute the float32 distances of a block on a device of torch, and copy the results back.
 
-    Float64 and pairs of a point and a template (`paired_distances`) stay on the processor. A thread
-    that the block starts is outside it, unless it runs in a copy of the context.
+    Float64 and `paired_distances` stay on the processor. A thread that the block starts is outside
+    it, unless it runs in a copy of the context.
 
     Parameters
     ----------
@@ -77,13 +77,7 @@ def on_device(device: str | None) -> Iterator[None]:
 
 
 def require_device(device: str) -> None:
-    """Refuse a device that torch cannot use.
-
-    Raises
-    ------
-    TemplateError
-        There is no torch, or no such device; the message names the remedy.
-    """
+    """Refuse a device that torch cannot use with a TemplateError, which names the remedy."""
     _torch().usable(device)
 
 
@@ -150,10 +144,10 @@ def nearest(
 ) -> Neighbours:
     """Find the K nearest templates of every probe, without the matrix of all distances.
 
+    Parameters and errors are those of `pairwise_distances`, in float32.
+
     Parameters
     ----------
-    probes, templates, metric, steps, threads
-        As of `pairwise_distances`, in float32.
     k : int
         At least 1.
     of_templates
@@ -164,13 +158,7 @@ def nearest(
     Returns
     -------
     Neighbours
-        Of shape (P, K), or (T, K) with ``of_templates``; the distances are those of
-        `pairwise_distances`.
-
-    Raises
-    ------
-    InvalidEmbedding, InvalidTemplate, TemplateError
-        As of `pairwise_distances`.
+        Of shape (P, K), or (T, K) with ``of_templates``.
     """
     if k < 1:
         raise TemplateError(f"{k} neighbours cannot be found; k is at least 1")
@@ -202,10 +190,9 @@ def paired_distances(
     dtype: DTypeLike = np.float32,
     as_stored: bool = False,
 ) -> Floats:
-    """Distances of probe i to template i, computed in float64 whatever ``dtype`` is.
+    """Distances of probe i to template i, computed by NumPy in float64 whatever ``dtype`` is.
 
-    Under `on_device`, float32 distances of lifted probes are computed there. Parameters and errors
-    are those of `pairwise_distances`.
+    Parameters and errors are those of `pairwise_distances`.
 
     Parameters
     ----------
@@ -221,12 +208,6 @@ def paired_distances(
     probes = _checked(probes, templates, dtype)
     if len(probes) != len(templates):
         raise TemplateError(f"{len(probes)} probes do not pair with {len(templates)} templates")
-    device = None if np.dtype(dtype) == np.float64 else _DEVICE.get()
-    if device is not None and isinstance(probes, SubspaceBatch):
-        distances: Floats = _torch().paired(
-            probes, templates, metric=metric, steps=steps, device=device
-        )
-        return distances
     every = np.arange(len(probes))
     return exact.pairs(
         probes, templates, every, every, metric=metric, steps=steps, as_stored=as_stored
@@ -234,13 +215,7 @@ def paired_distances(
 
 
 def warm_up() -> None:
-    """Compile the loops of the extra ``evaluate``, or load them from their cache.
-
-    Raises
-    ------
-    TemplateError
-        numba is not installed; the message names the remedy.
-    """
+    """Compile the loops of the extra ``evaluate``, or load them; a TemplateError without numba."""
     compiled = _compiled()
     if compiled is None:
         raise TemplateError(

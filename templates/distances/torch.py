@@ -7,11 +7,10 @@ import this file.
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from templates.distances import exact
@@ -81,23 +80,6 @@ def tiles(
             yield rows, columns, out
 
 
-def paired(
-    probes: SubspaceBatch, templates: SubspaceBatch, *, metric: Metric, steps: int, device: str
-) -> NDArray[np.float32]:
-    """Distances of lifted probe i to template i, (P,)."""
-    there, out = usable(device), np.empty(len(probes), dtype=np.float32)
-    numbers = (probes.m + templates.m + 2) * probes.n
-    for part in parts(len(out), max(1, _TILE_BYTES.get(there.type, 128 << 20) // 4 // numbers)):
-        left, right = (stacked(side[part], metric, there) for side in (probes, templates))
-        with ieee_products(there):
-            block = left.rows.transpose(0, 1) @ right.rows.permute(1, 2, 0)
-            squares = left.squares, right.squares
-            out[part] = _distances(block, *squares, metric=metric, steps=steps).cpu().numpy()
-    near = np.flatnonzero(~((out >= NEAR) & (out < np.inf)))
-    out[near] = exact.pairs(probes, templates, near, near, metric=metric, steps=steps)
-    return out
-
-
 def stacked(side: Probes, metric: Metric, device: torch.device) -> Rows:
     """Copy points or subspaces to a device, those of the sphere scaled to it."""
     spherical = metric is Metric.SPHERICAL
@@ -120,28 +102,14 @@ def stacked(side: Probes, metric: Metric, device: torch.device) -> Rows:
 
 @contextmanager
 def ieee_products(device: torch.device) -> Iterator[None]:
-    """Compute float32 products in float32: no TF32, no bfloat16, no autocast, no gradients.
-
-    torch has an older and a newer setting for this and refuses to read the older one where only
-    the newer has been changed. Setting the older one sets both.
-    """
-    kinds = torch.backends.cuda, torch.backends.mkldnn
-    backends: list[Any] = [kind.matmul for kind in kinds if hasattr(kind, "matmul")]
-    newer = [getattr(backend, "fp32_precision", None) for backend in backends]
-    try:
-        older = torch.get_float32_matmul_precision()
-    except RuntimeError:
-        older = None
+    """Compute float32 products in float32: no TF32, no bfloat16, no autocast, no gradients."""
+    before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("highest")
     try:
         with torch.no_grad(), torch.autocast(device.type, enabled=False):
             yield
     finally:
-        if older is not None:
-            torch.set_float32_matmul_precision(older)
-        else:
-            for backend, precision in zip(backends, newer, strict=True):
-                backend.fp32_precision = precision
+        torch.set_float32_matmul_precision(before)
 
 
 def _distances(

@@ -31,7 +31,7 @@ from templates.store.audit_log import PROGRAM, By, Entry
 from templates.store.context import StoreContext
 from templates.store.schema import ApiKeyRow, TenantRow
 from templates.store.secrets import SecretName
-from templates.store.tenants import Tenants, tenant_id_of
+from templates.store.tenants import tenant_of
 
 MAX_LABEL = 128
 
@@ -95,9 +95,8 @@ class NewApiKey:
 class ApiKeys:
     """Repository of API keys."""
 
-    def __init__(self, context: StoreContext, tenants: Tenants) -> None:
+    def __init__(self, context: StoreContext) -> None:
         self._context = context
-        self._tenants = tenants
 
     def create(
         self,
@@ -255,7 +254,7 @@ class ApiKeys:
         token = f"vf_{key.prefix}_{os.urandom(32).hex()}"
         row: dict[str, Any] = {
             **{name: getattr(key, name) for name in _FIELDS - {"tenant"}},
-            "tenant_id": tenant_id_of(connection, key.tenant),
+            "tenant_id": tenant_of(connection, key.tenant).id,
             "token_hash": _token_hash(token),
             "rights": ",".join(sorted(key.rights)),
         }

@@ -60,14 +60,7 @@ def archive_lines(context: StoreContext, file: Path, *, through: int | None, by:
     The archive ends before the first line that used up a token which may still be in time: without
     that line, the token would be good once more.
 
-    Parameters
-    ----------
-    file
-        A new file, which gets mode 0600.
-    through
-        Number of the last line to go; None for all that may.
-    by
-        Who asks: the log gets a line of it.
+    `through` is the number of the last line to go; None for all that may.
 
     Raises
     ------
@@ -91,14 +84,12 @@ def archive_lines(context: StoreContext, file: Path, *, through: int | None, by:
 
 def _last_to_go(connection: Connection, context: StoreContext, through: int | None) -> int | None:
     used_since = (context.clock() - TOKENS_LAST).astimezone(UTC).isoformat(timespec="microseconds")
-    first_use: int | None = connection.execute(
-        sa.select(sa.func.min(AuditRow.sequence)).where(
-            AuditRow.token.is_not(None), AuditRow.at > used_since
-        )
-    ).scalar()
-    if first_use is None:
-        return through
-    return first_use - 1 if through is None else min(through, first_use - 1)
+    query = sa.select(sa.func.min(AuditRow.sequence)).where(
+        AuditRow.token.is_not(None), AuditRow.at > used_since
+    )
+    first_use = connection.execute(query).scalar()
+    ends = [end for end in (through, first_use and first_use - 1) if end is not None]
+    return min(ends, default=None)
 
 
 def write_archive(
@@ -142,17 +133,9 @@ def write_archive(
 
 
 def verify_archive(file: Path, public_key: bytes) -> Archive:
-    """Check the signature of an archive, and that its lines are the signed ones.
+    """Check the signature of an archive by the 32 bytes that verify the deployment's receipts.
 
-    Parameters
-    ----------
-    public_key
-        The 32 bytes that verify the deployment's receipts.
-
-    Raises
-    ------
-    StoreError
-        If the file cannot be read, was altered, or is another deployment's.
+    :class:`StoreError` if the file cannot be read, was altered, or is another deployment's.
     """
     try:
         first, _, lines = file.read_bytes().partition(b"\n")

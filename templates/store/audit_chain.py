@@ -158,21 +158,9 @@ def rows_after(connection: Connection, after: int | None, most: int | None = Non
 
 
 def line_mac(key: bytes, values: Mapping[str, Any], previous: bytes) -> bytes:
-    """MAC of a line.
+    """MAC of a line: of its columns by name, and of the MAC of the line before.
 
-    Parameters
-    ----------
-    key
-        Secret of the chain, 32 bytes.
-    values
-        The columns of ``audit_log`` by name; ``mac`` is not looked at.
-    previous
-        MAC of the line before.
-
-    Raises
-    ------
-    TypeError
-        If a column holds what this program never writes.
+    A column that holds what this program never writes is a TypeError.
     """
     parts: list[str | int] = []
     for name in _COLUMNS[:-1]:

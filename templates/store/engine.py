@@ -60,17 +60,7 @@ def checked_url(text: str) -> URL:
 
 
 def make_engine(url: URL, *, timeout: float, pool_size: int, max_overflow: int) -> Engine:
-    """Make an engine; on SQLite a transaction begins where somebody says BEGIN.
-
-    Parameters
-    ----------
-    url
-        Of :func:`checked_url`.
-    timeout
-        Seconds to wait for a connection, or for another writer (SQLite).
-    pool_size, max_overflow
-        Connections kept, and further ones under load.
-    """
+    """Make an engine; on SQLite a transaction begins where somebody says BEGIN."""
     pool: dict[str, Any] = {
         "pool_size": pool_size,
         "max_overflow": max_overflow,

@@ -27,22 +27,15 @@ from templates.store.schema import (
     TenantRow,
 )
 from templates.store.subject_rows import subject_pk_of
-from templates.store.tenants import tenant_id_of, tenant_of
+from templates.store.tenants import tenant_of
 
 
 @dataclass(frozen=True)
 class Erasure:
-    """What an erasure did.
+    """What an erasure did: its receipt, and whether this call removed something.
 
-    Attributes
-    ----------
-    receipt
-        The signed receipt.
-    erased
-        Whether this call removed something; False when there was nothing (any more).
-    log_purged
-        False if SQLite could not empty its write-ahead log just now, as beside a long reader; the
-        next erasure or ``purge_log`` does it.
+    `log_purged` is False if SQLite could not empty its write-ahead log just now, as beside a long
+    reader; the next erasure or ``purge_log`` does it.
     """
 
     receipt: Receipt
@@ -74,13 +67,9 @@ class Erasures:
     def erase_if(
         self, tenant: str, subject_id: str, condition: sa.ColumnElement[bool], *, by: By
     ) -> Receipt | None:
-        """:meth:`erase` a subject whose row meets a condition when it is erased.
+        """:meth:`erase` a subject whose row meets a condition when it is erased; None otherwise.
 
-        Returns
-        -------
-        Receipt or None
-            None where the subject does not meet it, or is not there; nothing is done then.
-            Emptying SQLite's write-ahead log is left to the caller, who may erase many.
+        Emptying SQLite's write-ahead log is left to the caller, who may erase many.
         """
         subject_id = checked_subject_id(subject_id)
         query = (
@@ -123,7 +112,7 @@ class Erasures:
         self, connection: Connection, tenant: str, subject_id: str, by: By
     ) -> tuple[Receipt, bool]:
         pseudonym = self._context.signer.pseudonym(tenant, subject_id)
-        tenant_id = tenant_id_of(connection, tenant)
+        tenant_id = tenant_of(connection, tenant).id
         subject_pk = subject_pk_of(connection, tenant_id, subject_id)
         failed_attempts = _delete(
             connection,

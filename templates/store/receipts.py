@@ -100,17 +100,7 @@ class ReceiptSigner:
     def sign(
         self, kind: str, *, erased: Mapping[str, int], erased_at: datetime, **claims: Any
     ) -> Receipt:
-        """Write and sign a receipt, with a random id of its own.
-
-        Parameters
-        ----------
-        kind
-            :data:`SUBJECT_KIND` or :data:`TENANT_KIND`.
-        erased
-            Number of records of each kind that went.
-        claims
-            What :class:`Receipt` lists beside these.
-        """
+        """Write and sign a receipt of a kind, with a random id and these claims."""
         body = {
             "kind": kind,
             "version": _VERSION,
@@ -141,10 +131,7 @@ def key_fingerprint(public_key: bytes) -> str:
 
 
 def tenant_receipt_name(tenant: str) -> str:
-    """Column ``pseudonym`` of a tenant's receipts: no subject's, since those are keyed.
-
-    Not secret: the receipt itself names the tenant.
-    """
+    """Column ``pseudonym`` of a tenant's receipts. Not secret: the receipt names the tenant."""
     return hashlib.sha256(encode_parts("tenant erasure", tenant)).hexdigest()
 
 
@@ -171,10 +158,7 @@ def latest_receipt(connection: Connection, pseudonym: str) -> Receipt | None:
 def verify_receipt(receipt: Receipt, public_key: bytes) -> dict[str, Any]:
     """Check the signature and the form of a subject's or a tenant's receipt; return its claims.
 
-    Raises
-    ------
-    StoreError
-        If it was not signed with this key, was altered, or is no erasure receipt.
+    :class:`StoreError` if it was not signed with this key, was altered, or is no erasure receipt.
     """
     claims = verify_claims(receipt, public_key)
     if claims.get("kind") not in (SUBJECT_KIND, TENANT_KIND) or claims.get("version") != _VERSION:
@@ -183,13 +167,7 @@ def verify_receipt(receipt: Receipt, public_key: bytes) -> dict[str, Any]:
 
 
 def verify_claims(signed: Receipt, public_key: bytes) -> dict[str, Any]:
-    """Check the signature of what :func:`sign_claims` signed; return the claims.
-
-    Raises
-    ------
-    StoreError
-        If it was not signed with this key, or was altered.
-    """
+    """Check the signature of what :func:`sign_claims` signed; return the claims."""
     try:
         key = Ed25519PublicKey.from_public_bytes(public_key)
     except ValueError:

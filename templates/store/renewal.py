@@ -25,17 +25,7 @@ KEPT = frozenset({SecretName.PSEUDONYM, SecretName.LIFTS})
 
 @dataclass(frozen=True)
 class Renewed:
-    """What a renewal did.
-
-    Attributes
-    ----------
-    archive
-        The lines of the old chain.
-    receipts
-        Number of receipts that were signed again.
-    refused
-        Prefixes of API keys whose rows were made up or altered.
-    """
+    """The lines of the old chain, receipts signed again, and prefixes of keys that were altered."""
 
     archive: Archive
     receipts: int
@@ -45,14 +35,8 @@ class Renewed:
 def renew_secrets(context: StoreContext, api_keys: ApiKeys, archive: Path, *, by: By) -> Renewed:
     """Draw every secret but those that stay anew, in one write.
 
-    Put a new master key in force first, and drop the old one afterwards.
-
-    Parameters
-    ----------
-    archive
-        New file for the audit log so far.
-    by
-        Who asks: the new chain begins with a line of it.
+    Put a new master key in force first, and drop the old one afterwards. `archive` is a new file
+    for the audit log so far; the new chain begins with a line of the renewal.
 
     Raises
     ------

@@ -74,7 +74,7 @@ class TemplateStore:
         self.signer = context.signer
         self.audit_log = context.audit_log
         self.tenants = Tenants(context)
-        self.api_keys = ApiKeys(context, self.tenants)
+        self.api_keys = ApiKeys(context)
         self.subjects = Subjects(context)
         self.attempts = Attempts(context, lockout)
         self.erasures = Erasures(context)
@@ -85,12 +85,8 @@ class TemplateStore:
     def upgrade(self) -> None:
         """Bring the schema to this program's version; safe when several workers start at once.
 
-        Raises
-        ------
-        BrokenAuditLog
-            If the audit log has begun, and its secret is gone.
-        SealError
-            If the database was made with another master key.
+        :class:`BrokenAuditLog` if the audit log has begun and its secret is gone, and
+        :class:`SealError` if the database was made with another master key.
         """
         migrate.upgrade(self.database)
         self.database.write(self._set_up)
@@ -160,10 +156,7 @@ class TemplateStore:
     def purge(self) -> bool:
         """Remove expired records, and on SQLite empty the write-ahead log.
 
-        Returns
-        -------
-        bool
-            False if a reader outlasted the wait: the log is emptied another time.
+        False if a reader outlasted the wait: the log is emptied another time.
         """
         self.attempts.expire()
         return self.database.purge_log()

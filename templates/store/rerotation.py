@@ -11,14 +11,11 @@ nobody has to enroll again. Its id stays, and with the new key gives another rot
 what is stored from now on. A copy of the database that was taken before, with its rotation key and
 master key, keeps what it had.
 
-Each move rounds to the stored precision once more. In half precision at n = 512 and m = 16 the
-distance of a probe to the template then differs from the one before by 1.3·10⁻⁵ in the root mean
-square, and by 8·10⁻⁵ at most over 400,000 pairs: as much as the first rounding costs
-(``tests/templates/store/test_rerotation.py``). They add up like independent errors: after three
-moves the distance is 2.6·10⁻⁵ from that to the template before any rounding.
+Each move rounds to the stored precision once more: as much as the first rounding costs, in half
+precision 1.3·10⁻⁵ of a distance in the root mean square (docs/results/deployment.md).
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -52,10 +49,6 @@ class Rerotation:
         """Make a new key, under which templates are enrolled from now on; returns its epoch.
 
         Stored templates stay under theirs until :meth:`move` has seen them.
-
-        Raises
-        ------
-        UnknownTenant
         """
 
         def work(connection: Connection) -> int:
@@ -85,8 +78,6 @@ class Rerotation:
 
         Parameters
         ----------
-        tenant
-            Whose templates.
         binding
             Of the contract that they belong to. Templates of any other are left to be enrolled
             again.
@@ -101,8 +92,7 @@ class Rerotation:
         ------
         UnknownTenant
         StoreError
-            At the end, if rows do not open or hold no template. All others are moved;
-            :meth:`subjects_of_old_epochs` names the subjects to enroll again or erase.
+            At the end, if rows do not open or hold no template. All others are moved.
         """
         database, total, broken, after = self._context.database, 0, 0, ""
         rotations = _Rotations(self._tenants, tenant, binding)
@@ -135,32 +125,24 @@ class Rerotation:
             lambda connection: _count_older(connection, tenant_of(connection, tenant))
         )
 
-    def subjects_of_old_epochs(self, tenant: str, *, batch: int = 1000) -> Iterator[str]:
+    def subjects_of_old_epochs(self, tenant: str) -> list[str]:
         """Ids, in order, of the subjects whose templates are not in the current epoch."""
-        owner, after = self._tenants.get(tenant), ""
-        query = (
-            sa.select(SubjectRow.subject_id)
-            .join(TemplateRow, TemplateRow.subject_pk == SubjectRow.id)
-            .where(_is_older(owner))
-            .order_by(SubjectRow.subject_id)
-            .limit(batch)
-        )
-        while rows := self._context.database.read(
-            lambda connection, after=after: connection.execute(  # type: ignore[misc]
-                query.where(SubjectRow.subject_id > after)
-            ).all()
-        ):
-            for (after,) in rows:
-                yield after
+
+        def work(connection: Connection) -> list[str]:
+            query = (
+                sa.select(SubjectRow.subject_id)
+                .join(TemplateRow, TemplateRow.subject_pk == SubjectRow.id)
+                .where(_is_older(tenant_of(connection, tenant)))
+                .order_by(SubjectRow.subject_id)
+            )
+            return list(connection.execute(query).scalars())
+
+        return self._context.database.read(work)
 
     def retire(self, tenant: str, *, by: By = PROGRAM) -> int:
         """Drop the keys of all epochs but the current one; returns how many.
 
-        Raises
-        ------
-        UnknownTenant
-        StoreError
-            If templates of older epochs are left.
+        :class:`StoreError` if templates of older epochs are left.
         """
 
         def work(connection: Connection) -> int:

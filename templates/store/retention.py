@@ -25,17 +25,8 @@ RETENTION = By("retention")
 class Retention:
     """For how long a subject is kept; None is for ever.
 
-    Parameters
-    ----------
-    max_age
-        Time since the latest enrollment.
-    max_disuse
-        Time since the subject was last accepted, or enrolled where that is later.
-
-    Raises
-    ------
-    StoreError
-        For a time that is not more than nothing, or is more than a hundred years.
+    `max_age` is time since the latest enrollment, `max_disuse` since the subject was last accepted,
+    or enrolled where that is later.
     """
 
     max_age: timedelta | None = None
@@ -81,16 +72,8 @@ class RetentionJob:
     def erase_expired(self, retention: Retention, *, by: By = RETENTION, batch: int = BATCH) -> int:
         """Erase every subject that is due, of all tenants; returns how many.
 
-        It may be interrupted, run again, and run by several workers at once.
-
-        Parameters
-        ----------
-        retention
-            Who is due.
-        by
-            Actor of the audit lines.
-        batch
-            Subjects that are listed at once.
+        It may be interrupted, run again, and run by several workers at once. `batch` subjects are
+        listed at once.
         """
         if retention.keeps_all:
             return 0

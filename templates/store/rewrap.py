@@ -46,12 +46,7 @@ class WrappedKeys:
     def rewrap(self, *, batch: int = 200, progress: Callable[[int], None] | None = None) -> int:
         """Bring every wrapped blob under the keyring's current key; returns how many were not.
 
-        Parameters
-        ----------
-        batch
-            Rows in one transaction.
-        progress
-            Called after each transaction with the number of rows it wrapped again.
+        `progress` is called after each transaction, of `batch` rows, with the number it wrapped.
 
         Raises
         ------

@@ -29,13 +29,7 @@ class SecretName(StrEnum):
 
 
 class Secrets:
-    """The secrets of a deployment, opened at the first use and kept in memory.
-
-    Parameters
-    ----------
-    database, keyring, clock
-        Where they are kept, what wraps them, and what time it is.
-    """
+    """The secrets of a deployment, opened at the first use and kept in memory."""
 
     def __init__(self, database: Database, keyring: MasterKeyring, clock: Clock) -> None:
         self._database = database
@@ -44,15 +38,7 @@ class Secrets:
         self._opened: dict[str, bytes] = {}
 
     def get(self, name: SecretName) -> bytes:
-        """Return a secret.
-
-        Raises
-        ------
-        StoreError
-            If the database has none of this name.
-        SealError
-            If it was wrapped by another master key.
-        """
+        """Return a secret; :class:`StoreError` where the database has none of this name."""
         if name not in self._opened:
             self.load()
         if name not in self._opened:

@@ -141,11 +141,7 @@ class Subjects:
 
         Raises
         ------
-        InvalidIdentifier, UnknownTenant, StoreError, StoreUnavailable
-        EnrollmentConflict
-            If the subject does not meet the precondition.
-        Replayed
-            If the token was used before.
+        InvalidIdentifier, UnknownTenant, StoreError, StoreUnavailable, EnrollmentConflict, Replayed
 
         Notes
         -----
@@ -201,13 +197,7 @@ class Subjects:
         return stored
 
     def record_export(self, tenant: str, subject_id: str, *, template_id: str, by: By) -> None:
-        """Write the line of an export, while the template is still the subject's.
-
-        Raises
-        ------
-        StoreBusy
-            If the subject was enrolled again, or erased, since the template was read.
-        """
+        """Write the line of an export; :class:`StoreBusy` if it is not the subject's any more."""
         context = self._context
         query = select_subjects((TemplateRow.template_id,), tenant).where(
             SubjectRow.subject_id == checked_subject_id(subject_id)

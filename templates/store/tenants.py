@@ -46,10 +46,7 @@ class Tenant:
 
 @dataclass(frozen=True)
 class RotationKey:
-    """The secret that the rotations of a tenant's templates derive from.
-
-    See ``templates.keys.rotation``.
-    """
+    """The secret that a tenant's rotations derive from (``templates.keys.rotation``)."""
 
     epoch: int
     key: bytes = field(repr=False)
@@ -97,12 +94,7 @@ class Tenants:
         return tuple(Tenant(**row._mapping) for row in rows)
 
     def set_template_enrollment(self, name: str, allowed: bool, *, by: By = PROGRAM) -> Tenant:
-        """Allow clients of a tenant to enroll templates that they made themselves, or forbid it.
-
-        Raises
-        ------
-        UnknownTenant
-        """
+        """Allow clients of a tenant to enroll templates that they made themselves, or forbid it."""
         outcome = "template-enrollment-on" if allowed else "template-enrollment-off"
         entry = Entry("tenant-settings", outcome, by, checked_tenant_name(name))
 
@@ -155,13 +147,7 @@ class Tenants:
         )
 
     def _last_epoch_of_erased(self, connection: Connection, name: str) -> int:
-        """Last epoch of the latest tenant of this name that was erased, by its receipt; else 0.
-
-        Raises
-        ------
-        StoreError
-            If the receipt does not carry this deployment's signature.
-        """
+        """Last epoch of the latest tenant of this name that was erased, by its receipt; else 0."""
         receipt = latest_receipt(connection, tenant_receipt_name(name))
         if receipt is None:
             return 0
@@ -177,11 +163,6 @@ def tenant_of(connection: Connection, name: str) -> Tenant:
     if row is None:
         raise UnknownTenant.of_name(name)
     return Tenant(**row._mapping)
-
-
-def tenant_id_of(connection: Connection, name: str) -> str:
-    """Row id of a tenant, or :class:`UnknownTenant`."""
-    return tenant_of(connection, name).id
 
 
 _TENANTS: Any = sa.select(*(getattr(TenantRow, name) for name in Tenant.__dataclass_fields__))
