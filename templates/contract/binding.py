@@ -23,22 +23,7 @@ def embedding_id(*, embedder_sha256: str, preprocessing: Mapping[str, object]) -
     Decoys hide a descriptor only if they lie in its space; this id is how a decoy source says
     which one that is (``DecoySource.made_with``).
 
-    Parameters
-    ----------
-    embedder_sha256
-        SHA-256 of the embedder's ONNX file, 64 hexadecimal digits.
-    preprocessing
-        Its version, alignment template, size, channel order, mean, scale and flip.
-
-    Returns
-    -------
-    str
-        SHA-256 of the canonical JSON of both, 64 hexadecimal digits.
-
-    Raises
-    ------
-    ContractError
-        Where the preprocessing is not plain JSON.
+    Parameters are those of :class:`Binding`; the id is the SHA-256 of the canonical JSON of both.
     """
     return digest({"embedder_sha256": embedder_sha256, "preprocessing": preprocessing})
 
@@ -97,13 +82,7 @@ class Binding(JsonValue):
     def require_embedder(
         self, *, embedder_sha256: str, preprocessing: Mapping[str, object], n: int
     ) -> None:
-        """Refuse a pack whose embeddings this contract does not describe.
-
-        Raises
-        ------
-        ContractMismatch
-            Naming both sides.
-        """
+        """Refuse a pack whose embeddings this contract does not describe, naming both sides."""
         if n != self.n:
             raise ContractMismatch(
                 f"the contract is for embeddings of {self.n} numbers, the pack gives {n}; "
@@ -131,18 +110,7 @@ class Binding(JsonValue):
     def require_source(self, *, source_id: str, made_with: str | None = None) -> None:
         """Refuse a decoy source other than the contract's, or of another descriptor space.
 
-        Parameters
-        ----------
-        source_id
-            The source's id.
-        made_with
-            The source's ``made_with``; None, as of a source made in code, is not held against
-            the binding.
-
-        Raises
-        ------
-        ContractMismatch
-            Naming both sides.
+        A ``made_with`` of None, as of a source made in code, is not held against the binding.
         """
         if made_with is not None and made_with != self.embedding_id:
             raise ContractMismatch(
@@ -158,13 +126,7 @@ class Binding(JsonValue):
             )
 
     def require_contract(self, contract_id: str, *, what: str) -> None:
-        """Refuse a template of another contract.
-
-        Raises
-        ------
-        ContractMismatch
-            Naming both sides.
-        """
+        """Refuse a template of another contract, naming both sides."""
         if contract_id != self.contract_id:
             raise ContractMismatch(
                 f"{what} belongs to the contract {contract_id[:16]}…, the service runs "

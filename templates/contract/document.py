@@ -127,17 +127,8 @@ class Contract(JsonValue):
     def nobody(self, source: DecoySource) -> Nobody:
         """Templates of nobody under this contract, with the decoys that lifting clients take.
 
-        They are made once: enrollers and verifiers of all tenants share the cohort.
-
-        Parameters
-        ----------
-        source
-            The contract's, reduced to its axes.
-
-        Raises
-        ------
-        ContractMismatch
-            Where it is another one.
+        They are made once: enrollers and verifiers of all tenants share the cohort. `source` is the
+        contract's, reduced to its axes; another one is a ContractMismatch.
         """
         binding = self.binding
         binding.require_source(source_id=source.source_id, made_with=source.made_with)

@@ -62,13 +62,7 @@ class LivenessCalibration(JsonValue):
         return score >= self.threshold
 
     def require_graphs(self, graphs: Sequence[str]) -> None:
-        """Refuse graphs that the threshold is not of.
-
-        Raises
-        ------
-        Uncalibrated
-            Where the pack has others, or feeds them otherwise.
-        """
+        """Refuse graphs that the threshold is not of, or that the pack feeds otherwise."""
         if tuple(graphs) != self.graphs:
             raise Uncalibrated(
                 "the contract's liveness threshold belongs to other liveness graphs, or to another "

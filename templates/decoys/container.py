@@ -28,20 +28,7 @@ Fields = Mapping[str, str | int | list[str]]
 
 
 def encode(fields: Fields, tensors: Mapping[str, NDArray[np.generic]]) -> bytes:
-    """Encode named arrays and a few plain fields.
-
-    Parameters
-    ----------
-    fields
-        Plain values; ``fields["format"]`` names what the bytes are.
-    tensors
-        float32 or uint8 arrays of rank 1 to 3.
-
-    Returns
-    -------
-    bytes
-        A safetensors file; equal input gives equal bytes.
-    """
+    """Encode named float32 or uint8 arrays and a few plain fields; equal input, equal bytes."""
     text = json.dumps(fields, sort_keys=True, separators=(",", ":"), ensure_ascii=True)
     arrays = {name: np.ascontiguousarray(array) for name, array in tensors.items()}
     return bytes(save(arrays, metadata={METADATA_KEY: text}))
@@ -50,27 +37,10 @@ def encode(fields: Fields, tensors: Mapping[str, NDArray[np.generic]]) -> bytes:
 def decode(
     data: bytes, *, what: str, max_bytes: int
 ) -> tuple[dict[str, object], dict[str, NDArray[np.generic]]]:
-    """Decode bytes that may be hostile.
+    """Decode bytes that may be hostile into the fields and arrays that `encode` was given.
 
-    Parameters
-    ----------
-    data
-        The whole file.
-    what
-        Name of the thing for error messages, such as ``"decoy generator"``.
-    max_bytes
-        Largest accepted size.
-
-    Returns
-    -------
-    tuple
-        The fields and the arrays, exactly as `encode` was given them. The caller checks names,
-        types, shapes and values.
-
-    Raises
-    ------
-    DecoyError
-        The bytes are not what `encode` writes.
+    The caller checks names, types, shapes and values. `what` names the thing in error messages; a
+    DecoyError says that the bytes are not what `encode` writes.
     """
     if len(data) > max_bytes:
         raise DecoyError(f"the {what} has {len(data)} bytes; at most {max_bytes} are accepted")
@@ -104,13 +74,7 @@ def decode(
 
 
 def write_private(path: Path, data: bytes) -> None:
-    """Replace `path` at once by a file of mode 0600; see `replace_private`.
-
-    Raises
-    ------
-    DecoyError
-        The file cannot be written.
-    """
+    """Replace `path` at once by a file of mode 0600; see `replace_private`."""
     try:
         replace_private(path, data)
     except OSError as error:
@@ -118,13 +82,7 @@ def write_private(path: Path, data: bytes) -> None:
 
 
 def read_bounded(path: Path, limit: int) -> bytes:
-    """Read a file of at most `limit` bytes.
-
-    Raises
-    ------
-    DecoyError
-        The file cannot be read or is larger.
-    """
+    """Read a file of at most `limit` bytes."""
     try:
         with path.open("rb") as file:
             size = os.fstat(file.fileno()).st_size

@@ -88,26 +88,11 @@ class DecoyGenerator:
 
     @classmethod
     def fit(cls, descriptors: NDArray[np.floating], *, made_with: str | None = None) -> Self:
-        """Fit to real embeddings.
+        """Fit to real embeddings: float32, shape (N, n), unit rows, N ≥ 100; thousands are good.
 
-        Parameters
-        ----------
-        descriptors
-            float32, shape (N, n), unit rows, N ≥ 100; several thousand give good decoys.
-        made_with
-            As for the class.
-
-        Returns
-        -------
-        DecoyGenerator
-            Of all n axes; :meth:`reduced` takes the leading ones. The same for the same embeddings
-            on one machine; another processor or number of threads rounds differently, and so gives
-            another `source_id`.
-
-        Raises
-        ------
-        DecoyError
-            Too few embeddings, or embeddings that are not finite unit vectors or hardly vary.
+        Of all n axes; :meth:`reduced` takes the leading ones. The same for the same embeddings on
+        one machine; another processor or number of threads rounds differently, and so gives
+        another `source_id`. A DecoyError for what :func:`fit_moments` cannot take.
         """
         return cls._of(fit_moments(descriptors), made_with)
 
@@ -122,22 +107,7 @@ class DecoyGenerator:
     ) -> Self:
         """Fit to many embeddings of any kind, adapted to few of the kind that is enrolled.
 
-        Parameters
-        ----------
-        descriptors
-            float32, shape (N, n), unit rows, N ≥ 100; tens of thousands give good decoys.
-        like
-            float32, shape (K, n), unit rows, K ≥ 100, of people who are not in ``descriptors`` and
-            will not be enrolled.
-        people
-            K names of those people.
-        made_with
-            As for the class.
-
-        Raises
-        ------
-        DecoyError
-            Too few of either, or embeddings that are not finite unit vectors or hardly vary.
+        Parameters are those of :func:`adapted_moments`; the people of ``like`` are never enrolled.
         """
         return cls._of(adapted_moments(descriptors, like, people), made_with)
 
@@ -159,13 +129,7 @@ class DecoyGenerator:
         return type(self)(np.eye(self.n), axes @ self.mean, np.tril(root), made_with=self.made_with)
 
     def reduced(self, k: int) -> Self:
-        """The generator of the leading ``k`` axes; itself where it has no more.
-
-        Raises
-        ------
-        DecoyError
-            It has fewer axes, or ``k`` is below 2.
-        """
+        """The generator of the leading ``k`` axes, 2 or more; itself where it has no more."""
         if not 2 <= k <= self.k:
             raise DecoyError(f"the decoys have {self.k} axes; {k} were asked for")
         if k == self.k:
@@ -238,11 +202,8 @@ class DecoyGenerator:
     ) -> NDArray[np.float32]:
         """Draw fresh decoys; see `DecoySource.draw`.
 
-        Raises
-        ------
-        DecoyError
-            `unlike` or `sub_databases` is asked for: both are choices among labelled real
-            embeddings, and choosing by the subject's attributes would leak them (docs/method.md).
+        A DecoyError where `unlike` or `sub_databases` is asked for: both are choices among labelled
+        real embeddings, and choosing by the subject's attributes would leak them (docs/method.md).
         """
         if rows < 0 or k < 0:
             raise DecoyError(f"rows and k must not be negative; seen {rows} and {k}")
@@ -276,13 +237,7 @@ class DecoyGenerator:
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
-        """Read what `to_bytes` wrote; `data` may be hostile.
-
-        Raises
-        ------
-        DecoyError
-            The bytes are not exactly what `to_bytes` writes for some generator.
-        """
+        """Read what `to_bytes` wrote; `data` may be hostile: anything else is a DecoyError."""
         fields, arrays = container.decode(
             data, what="decoy generator", max_bytes=MAX_GENERATOR_BYTES
         )
@@ -298,27 +253,12 @@ class DecoyGenerator:
         return cls(*parts, made_with=made_with)
 
     def save(self, path: Path) -> None:
-        """Write the generator as a plain file, which clients may have.
-
-        It holds no embedding, but tells who holds a photo whether that person was in the fit,
-        better than chance.
-
-        Raises
-        ------
-        DecoyError
-            The file cannot be written.
-        """
+        """Write the generator as a plain file, which clients may have."""
         container.write_private(path, self.to_bytes())
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Read what `save` wrote.
-
-        Raises
-        ------
-        DecoyError
-            The file cannot be read or is no decoy generator.
-        """
+        """Read what `save` wrote."""
         return cls.from_bytes(container.read_bounded(path, MAX_GENERATOR_BYTES))
 
     def _check(self) -> None:

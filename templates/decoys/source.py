@@ -17,24 +17,12 @@ _SHA256_HEX = re.compile(r"[0-9a-f]{64}")
 
 
 def take_made_with(fields: dict[str, object]) -> str | None:
-    """Take the ``made_with`` out of the fields of a file that may be hostile; None where absent.
-
-    Raises
-    ------
-    DecoyError
-        It is there, and is not 64 lower-case hexadecimal digits.
-    """
+    """Take the ``made_with`` out of the fields of a file that may be hostile; None where absent."""
     return checked_made_with(fields.pop("made_with")) if "made_with" in fields else None
 
 
 def checked_made_with(value: object) -> str:
-    """Give back a ``made_with`` that is one.
-
-    Raises
-    ------
-    DecoyError
-        It is not 64 lower-case hexadecimal digits.
-    """
+    """Give back a ``made_with`` that is one."""
     if not isinstance(value, str) or not _SHA256_HEX.fullmatch(value):
         raise DecoyError("made_with must be 64 lower-case hexadecimal digits, or absent")
     return value

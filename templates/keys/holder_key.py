@@ -26,26 +26,14 @@ def encode_holder_key(key: bytes | bytearray) -> str:
 
 
 def decode_holder_key(text: object) -> bytearray:
-    """Return the key of a text, to be wiped after its use.
-
-    Raises
-    ------
-    SealError
-        If it is no holder key; the message does not repeat it.
-    """
+    """Return the key of a text, to be wiped after its use; an error does not repeat the text."""
     if not isinstance(text, str) or not _KEY.fullmatch(text):
         raise SealError("a holder key is 32 bytes in base64url: 43 characters, and = or nothing")
     return bytearray(base64.urlsafe_b64decode(text.rstrip("=") + "="))
 
 
 def read_holder_key(path: Path) -> bytearray:
-    """Read a key from a private file that holds nothing else but the end of the line.
-
-    Raises
-    ------
-    SealError
-        If there is no such file, others may read it, or it holds no key.
-    """
+    """Read a key from a private file that holds nothing else but the end of the line."""
     source = f"the holder key file {path}"
     data = read_private(
         path,
@@ -63,13 +51,7 @@ def read_holder_key(path: Path) -> bytearray:
 
 
 def write_holder_key(path: Path, key: bytes | bytearray) -> None:
-    """Write a key into a new file of mode 0600.
-
-    Raises
-    ------
-    SealError
-        If there is a file already, or it cannot be written.
-    """
+    """Write a key into a new file of mode 0600; :class:`SealError` if there is one already."""
     try:
         create_private(path, f"{encode_holder_key(key)}\n".encode())
     except FileExistsError:

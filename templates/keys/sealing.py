@@ -129,12 +129,7 @@ class MasterKeyring:
         """Write a new key file with one random key, mode 0600, and load it.
 
         The file appears whole or not at all, and an existing one is never touched, so of several
-        processes that try at once exactly one succeeds.
-
-        Raises
-        ------
-        SealError
-            If the file exists already or cannot be written.
+        processes that try at once exactly one succeeds; the others get a :class:`SealError`.
         """
         path = Path(path)
         write_key_file(path, [os.urandom(KEY_BYTES)], replace=False)
