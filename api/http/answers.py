@@ -1,7 +1,6 @@
 """Answers: JSON with a request id, and the one shape of errors."""
 
 import json
-from collections.abc import Mapping
 from typing import Any
 
 from starlette.requests import Request
@@ -21,18 +20,10 @@ class JsonAnswer(Response):
         return json.dumps(content, allow_nan=False, separators=(",", ":")).encode("ascii")
 
 
-def answer(
-    request: Request,
-    body: Mapping[str, Any],
-    *,
-    status: int = 200,
-    headers: Mapping[str, str] | None = None,
-) -> JsonAnswer:
-    """Return a success with the request id in its body."""
-    content = {**body, "request_id": request.state.request_id}
-    if request.app.state.settings.demo:
-        content["notice"] = DEMO_NOTICE
-    return JsonAnswer(content, status_code=status, headers=dict(headers or {}))
+def common(request: Request) -> dict[str, Any]:
+    """Return what every answer says: the request's id, and with the demo model a notice."""
+    demo = request.app.state.settings.demo
+    return {"request_id": request.state.request_id, "notice": DEMO_NOTICE if demo else None}
 
 
 def has_copy(request: Request, etag: str) -> bool:

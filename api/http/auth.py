@@ -8,13 +8,13 @@ from typing import Annotated, Any, TypeVar
 from fastapi import Depends, Request, Security
 from fastapi.security import APIKeyHeader, HTTPAuthorizationCredentials, HTTPBearer
 
+from api.http.answers import common
 from api.http.audit import by
 from api.http.errors import ApiError
 from api.http.tokens import SubjectToken, opened_token, prefix_of
 from api.limits.admission import Gate
 from api.limits.rates import RateLimits
 from api.service.runtime import Runtime
-from models.demo import DEMO_NOTICE
 from templates.keys.api_token import is_token
 from templates.store import TemplateStore
 from templates.store.api_keys import ApiKey
@@ -82,9 +82,8 @@ class Call:
 
     @property
     def common(self) -> dict[str, Any]:
-        """What every answer says: the request's id, and with the demo model a notice."""
-        notice = DEMO_NOTICE if self.runtime.settings.demo else None
-        return {"request_id": self.request.state.request_id, "notice": notice}
+        """What every answer says."""
+        return common(self.request)
 
     def require(self, *rights: str) -> None:
         """Refuse unless the caller has one of these rights."""

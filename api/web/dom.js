@@ -78,24 +78,6 @@ export function facts(pairs) {
   );
 }
 
-// A table, whose rows become cards on a narrow screen: each cell has the name of its column.
-export function table(caption, head, rows) {
-  const row = ([first, ...rest]) =>
-    h(
-      "tr",
-      {},
-      h("th", { scope: "row" }, first),
-      rest.map((cell, index) => h("td", { "data-column": head[index + 1] }, cell)),
-    );
-  return h(
-    "table",
-    {},
-    h("caption", {}, caption),
-    h("thead", {}, h("tr", {}, head.map((name) => h("th", { scope: "col" }, name)))),
-    h("tbody", {}, rows.map(row)),
-  );
-}
-
 // What few visitors need, behind a line that opens it.
 export const folded = (summary, ...content) =>
   h("details", {}, h("summary", {}, summary), h("div", { class: "inside" }, content));

@@ -1,39 +1,15 @@
-import { download, facts, folded, h, oneIn, percent, table, when } from "./dom.js";
+import { download, facts, folded, h, percent, when } from "./dom.js";
 import { call, session } from "./service.js";
 import { problemBox } from "./words.js";
 
-const RIGHTS = {
-  enroll: "enroll, list and describe people",
-  verify: "verify people",
-  erase: "erase people",
-  export: "export and import templates",
-  scores: "see distances",
-  embeddings: "send embeddings and templates",
-  metrics: "read the metrics",
-  admin: "lift lockouts and read the audit log",
-};
-
 export function serviceView() {
-  const { contract } = session;
-  const save = () => download("contract.json", JSON.stringify(contract, null, 1));
+  const { contract, own } = session;
   const root = h(
     "section",
     {},
     h("div", { class: "heading" }, h("h1", { tabindex: "-1" }, "Service"), health()),
     privacyCard(contract),
-    h("div", { class: "columns" }, storedCard(contract), keyCard(session.own)),
-    h(
-      "section",
-      { class: "card" },
-      h(
-        "div",
-        { class: "heading" },
-        h("h2", {}, "Levels"),
-        h("button", { type: "button", class: "secondary", onclick: save }, "Download contract"),
-      ),
-      h("p", { class: "hint" }, "How often each level accepts a stranger, and rejects the right person, as counted when it was calibrated."),
-      contract.calibrations.map(levelTable),
-    ),
+    h("div", { class: "columns" }, storedCard(contract), keyCard(own)),
   );
   return { root };
 }
@@ -98,7 +74,9 @@ function tile(title, judgement) {
 }
 
 // What the service keeps of a person, and by which contract.
-function storedCard({ binding, contract_id: id, recorded, default_level: level, receipt_key: receipt }) {
+function storedCard(contract) {
+  const { binding, contract_id: id, recorded, default_level: level, receipt_key: receipt } = contract;
+  const save = () => download("contract.json", JSON.stringify(contract, null, 1));
   return h(
     "section",
     { class: "card" },
@@ -115,6 +93,7 @@ function storedCard({ binding, contract_id: id, recorded, default_level: level, 
         ["Receipt key", h("code", {}, receipt.public_key)],
       ]),
     ),
+    h("p", { class: "row" }, h("button", { type: "button", class: "secondary", onclick: save }, "Download contract")),
   );
 }
 
@@ -127,34 +106,8 @@ function keyCard(own) {
       ["Key", h("code", {}, `vf_${own.prefix}_…`)],
       ["Tenant", own.tenant],
       ["Expires", own.expires_at ? when(own.expires_at) : "never"],
-    ]),
-    h(
-      "ul",
-      { class: "rights", "aria-label": "Rights" },
-      Object.entries(RIGHTS).map(([right, meaning]) => {
-        const has = own.rights.includes(right);
-        return h("li", { class: has ? "has" : "lacks" }, h("strong", {}, right), ` ${has ? "may" : "may not"} ${meaning}`);
-      }),
-    ),
-  );
-}
-
-function levelTable({ mode, probe_photos: photos, probe_m: m, levels }) {
-  const many = photos === 1 ? "one photo" : `${photos} photos`;
-  return table(
-    mode === "p2s" ? `A probe of ${many}` : `A lifted probe of ${many}, m = ${m}`,
-    ["Level", "Strangers accepted: target", "Strangers accepted: counted", "Right people rejected"],
-    levels.map(({ name, target_fmr: target, fmr, fnmr }) => [
-      name,
-      target ? `${percent(target)} (${oneIn(target)})` : "none",
-      counted(fmr),
-      counted(fnmr),
+      ["Rights", own.rights.join(", ")],
+      ["Levels", own.levels.join(", ")],
     ]),
   );
-}
-
-function counted(rate) {
-  if (!rate) return "unknown";
-  const value = rate.trials ? rate.errors / rate.trials : null;
-  return `${percent(value)} (${rate.errors.toLocaleString("en")} of ${rate.trials.toLocaleString("en")})`;
 }

@@ -190,7 +190,7 @@ def walk_people(tab: BrowserTab, demo: Served) -> Iterator[str]:
 
 
 def walk_service(tab: BrowserTab, demo: Served) -> Iterator[str]:
-    """The verdict, what is stored, the key's rights, the levels."""
+    """The verdict, what is stored, and what the key may do."""
     page = tab.page
     tab.sign_in(demo.token)
     tab.open("Service")

@@ -6,7 +6,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import BaseRoute
 
-from api.http.answers import answer
+from api.http.answers import JsonAnswer, common
 from api.http.errors import ApiError
 from api.http.routes.page import HEADERS, route_of
 from api.limits.rates import address_of
@@ -32,7 +32,7 @@ def drawn_people_routes() -> list[BaseRoute]:
 
 async def list_people(request: Request) -> Response:
     """List them, those who are enrolled first."""
-    return answer(request, {"people": list(_PEOPLE), "shots": SHOTS})
+    return JsonAnswer({**common(request), "people": list(_PEOPLE), "shots": SHOTS})
 
 
 async def draw_photo(request: Request) -> Response:
