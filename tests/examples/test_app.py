@@ -9,7 +9,7 @@ from typing import Any
 
 import httpx
 import pytest
-from playwright.sync_api import Browser, Page, Route, expect
+from playwright.sync_api import Browser, Page, expect
 
 from models.pack import ModelPack
 from tests.clients.conftest import Running
@@ -349,31 +349,5 @@ def test_a_browser_sends_a_private_template_and_nothing_else_of_a_face(
         ):
             page.evaluate(PLANT, [recording.url + "/planted", base64.b64encode(data).decode()])
             assert any(what in leak.what for leak in search.find(recording.sent)), what
-    finally:
-        context.close()
-
-
-def test_an_answer_that_is_lost_lets_in_all_the_same(
-    app: Proxy, browser: Browser, camera: FakeCamera, people: dict[str, list[Path]]
-) -> None:
-    """The server asks what came of the token, and the page asks the server."""
-    context = browser.new_context()
-    try:
-        page = context.new_page()
-        lost = []
-
-        def lose(route: Route) -> None:
-            lost.append(route.fetch().status)
-            route.abort()
-
-        page.route("**/enrollment", lose)
-        page.goto(app.url)
-        camera.shows(people[WHO][0])
-        sign(page, "ida", "Register")
-        stand_before(page, "Enroll")
-        told(page).to_have_text("Welcome, ida")
-        # Sent once: a token is used up by its first call.
-        assert lost == [201]
-        assert status_of_account(page) == 200
     finally:
         context.close()

@@ -212,23 +212,6 @@ def test_nobody_is_sent_to_a_stranger(bridge: httpx.Client, changes: dict[str, s
 
 
 @pytest.mark.parametrize(
-    ("changes", "error"),
-    [
-        ({"response_type": "token"}, "unsupported_response_type"),
-        ({"scope": "email"}, "invalid_scope"),
-        ({"code_challenge_method": "plain"}, "invalid_request"),
-        ({"code_challenge": ""}, "invalid_request"),
-    ],
-)
-def test_what_is_asked_wrongly_is_told_to_the_application(
-    bridge: httpx.Client, changes: dict[str, str], error: str
-) -> None:
-    told = returned(bridge.get("/authorize", params=ASKED | changes))
-    assert (told["error"], told["state"]) == (error, "of & mine")
-    assert "code" not in told
-
-
-@pytest.mark.parametrize(
     ("changes", "status", "error"),
     [({"code_verifier": "w" * 64}, 400, "invalid_grant"), ({"client_secret": ""}, 401,
      "invalid_client"), ({"client_id": "app", "client_secret": ""}, 400, "invalid_grant"),

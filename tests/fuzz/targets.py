@@ -148,25 +148,6 @@ def export(folder: Path) -> Target:
     return Target(read, (InvalidTemplate, ContractMismatch), Exports().make, 64)
 
 
-def decoys(folder: Path) -> Target:
-    """``templates.decoys``: generators that anybody may send, and sealed pools."""
-    from templates.decoys import load_source
-    from templates.errors import DecoyError, SealError
-    from templates.keys.randomness import Keystream
-    from tests.fuzz.tensors import SEALER, Decoys
-
-    file = folder / "case.decoys"
-
-    def read(data: bytes) -> None:
-        file.write_bytes(data)
-        source = load_source(file, SEALER)
-        stream = Keystream.seeded("fuzz", 0)
-        drawn = source.draw(2, 3, stream=stream)
-        demand(bool(np.isfinite(drawn).all()), "finite decoys")
-
-    return Target(read, (DecoyError, SealError), Decoys().make, 64)
-
-
 def body(folder: Path) -> Target:
     """``api.http.bodies``: JSON and multipart bodies, up to the largest that are read."""
     from starlette.requests import Request
@@ -212,6 +193,5 @@ TARGETS: dict[str, Callable[[Path], Target]] = {
     "template": template,
     "probe": probe,
     "export": export,
-    "decoys": decoys,
     "body": body,
 }

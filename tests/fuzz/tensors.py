@@ -13,9 +13,6 @@ from numpy.typing import NDArray
 
 from api.http.transfer import MAGIC, PURPOSE, Exported, ExportKey, seal_export
 from templates.contract import wire
-from templates.decoys import DecoyGenerator, DecoyPool
-from templates.decoys.pool import POOL_CONTEXT, POOL_MAGIC
-from templates.decoys.source import Attributes
 from templates.keys.randomness import Keystream
 from templates.keys.sealing import KeyringSealer, MasterKeyring
 from templates.space.subspace import SubspaceBatch
@@ -165,28 +162,3 @@ class Exports:
             sealed = KEYRING.seal(plain, purpose=PURPOSE, bound_to=[CONTRACT, TENANT])
         data = MAGIC + bytes.fromhex(CONTRACT) + sealed
         return data if rng.random() < 0.9 else mutated(rng, data, self.sound)
-
-
-class Decoys:
-    """Makes cases for the reader of decoy files: plain generators and sealed pools."""
-
-    def __init__(self) -> None:
-        rows = np.random.default_rng(0).normal(size=(120, 12))
-        rows /= np.linalg.norm(rows, axis=1, keepdims=True)
-        labels = [Attributes("a", "x"), Attributes("b", "y")] * 60
-        self.generators = [
-            DecoyGenerator.fit(rows, made_with=made).to_bytes() for made in (None, CONTRACT)
-        ]
-        self.pools = [
-            DecoyPool(rows)._encode(),
-            DecoyPool(rows, labels=labels, made_with=CONTRACT)._encode(),
-        ]
-
-    def make(self, rng: random.Random) -> bytes:
-        """One case."""
-        if rng.random() < 0.5:
-            return hostile_tensors(rng, rng.choice(self.generators), self.generators)
-        plain = hostile_tensors(rng, rng.choice(self.pools), self.pools)
-        with repeatable(rng):
-            data = POOL_MAGIC + SEALER.seal(plain, context=POOL_CONTEXT)
-        return data if rng.random() < 0.9 else mutated(rng, data, self.generators)

@@ -2,9 +2,6 @@
 
 import os
 import shutil
-import subprocess
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -12,8 +9,6 @@ from cryptography import x509
 
 from tests.api.server_process import ROOT
 from tests.certificates import self_signed
-from tests.patience import PATIENCE_S, wait_until
-from tests.ports import free_port
 
 PAGE = (ROOT / "docs" / "deploy.md").read_text(encoding="utf-8")
 NAME = "faces.example.org"
@@ -43,25 +38,3 @@ def write_configuration(block: str, folder: Path, listen: str) -> Path:
         f"http {{\naccess_log off;\n{kept}{block}}}\n"
     )
     return path
-
-
-@contextmanager
-def running_nginx(block: str, folder: Path, address: str) -> Iterator[str]:
-    """Run nginx with a block of the pages, at an address; gives its URL."""
-    require_nginx()
-    folder.mkdir()
-    listen = f"{address}:{free_port()}"
-    path = write_configuration(block, folder, listen)
-    command = ["nginx", "-p", folder, "-c", path, "-e", folder / "error.log"]
-    running = subprocess.Popen([*command, "-g", "daemon off;"])
-
-    def runs() -> bool:
-        assert running.poll() is None, (folder / "error.log").read_text()
-        return (folder / "pid").exists()
-
-    try:
-        wait_until(runs, what="nginx")
-        yield f"https://{listen}"
-    finally:
-        running.terminate()
-        running.wait(timeout=PATIENCE_S)

@@ -36,10 +36,6 @@ class FakeCamera:
             frame = frame.point([int(dark * value) for value in range(256)] * 3)
         self._write(frame)
 
-    def shows_the_browsers_test_picture(self) -> None:
-        """Show what Chromium's fake camera shows by itself: a disc with a mouth, and a timer."""
-        self._write(browsers_test_picture(SIZE))
-
     def _write(self, frame: Image.Image) -> None:
         out = io.BytesIO()
         frame.save(out, "JPEG", quality=92)

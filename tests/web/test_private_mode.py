@@ -3,7 +3,7 @@
 import base64
 import json
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -315,42 +315,6 @@ def test_what_private_mode_cannot_serve_goes_to_the_service_and_that_is_said(
     tab.open("Enroll")
     expect(switch).not_to_be_checked()
     expect(switch).to_be_enabled()
-
-
-def without_the_client(route: Route) -> None:
-    answer = route.fetch()
-    built = answer.text().replace('data-client="yes"', 'data-client="no"')
-    route.fulfill(response=answer, body=built)
-
-
-def with_a_larger_dimension(route: Route) -> None:
-    """The browser lifts to the largest dimension, which has no levels here."""
-    answer = route.fetch()
-    told = answer.json()
-    (lifted, *_) = (each for each in told["calibrations"] if each["mode"] == "s2s")
-    told["calibrations"].append({**lifted, "probe_m": lifted["probe_m"] + 1, "levels": []})
-    route.fulfill(response=answer, json=told)
-
-
-@pytest.mark.parametrize(
-    ("path", "answer", "says"),
-    [
-        ("/", without_the_client, "installed without the client that it needs"),
-        ("/v1/contract", with_a_larger_dimension, "not calibrated for lifted probes"),
-        (
-            "/assets/private.js",
-            lambda route: route.fulfill(status=404),
-            "Private mode could not be loaded: photos are sent to the service",
-        ),
-    ],
-)
-def test_what_private_mode_lacks_is_said_and_keeps_nobody_out(
-    served: Served, open_tab: OpenTab, path: str, answer: Callable[[Route], None], says: str
-) -> None:
-    tab = open_tab(served, sign_in=None)
-    tab.page.route(served.url + path, answer)
-    tab.sign_in(served.token)
-    expect(tab.page.get_by_text(says)).to_be_visible()
 
 
 def test_what_keeps_private_mode_from_working_is_said_and_nothing_else_is_sent(

@@ -8,7 +8,6 @@ from tests.api.deployment import photo, picture
 from tests.clients.conftest import Running
 from tests.clients.javascript.conftest import Node
 from tests.clients.proxy import Proxy
-from tests.ports import free_port
 
 
 def png(person: int, shot: int = 0) -> dict[str, str]:
@@ -117,52 +116,6 @@ def test_private_templates(node: Node, service: Running) -> None:
         pixels = picture(4, shot).tobytes()
         assert pixels[:64] not in sent
         assert base64.b64encode(pixels)[:64] not in sent
-
-
-def test_a_lost_answer(node: Node, service: Running) -> None:
-    """The same write once more, by the client itself or with the lift that the error has."""
-    probe: dict[str, Any] = {"call": "verify", "args": ["js-lost", [rgb(6, 1)]]}
-    lift = {"kept": "lift"}
-    outcomes = calls(
-        node,
-        service,
-        [
-            {"call": "prepare"},
-            {"call": "enroll", "args": ["js-lost", [rgb(6, 0)]], "lost": 1},
-            {"call": "enroll", "args": ["js-lost", lift]},
-            {**probe, "lost": 1},
-            {"call": "verify", "args": ["js-lost", lift]},
-        ],
-        retries={"sendings": 1},
-    )
-    _, first, again, lost, decided = outcomes
-    assert (first["error"], first["sent"]) == ("ConnectionFailed", True)
-    assert first["lift"].startswith("Lift")
-    assert again["value"]["replaced"] is True, "what the first sending wrote"
-    assert (lost["error"], decided["value"]["accepted"]) == ("ConnectionFailed", True)
-    _, enrolled, lost = calls(
-        node,
-        service,
-        [
-            {"call": "prepare"},
-            {"call": "enroll", "args": ["js-resent", [rgb(6, 0)]], "lost": 1},
-            {**probe, "lost": 3},
-        ],
-        retries={"first": 0.01},
-    )
-    assert enrolled["value"]["replaced"] is True
-    assert lost["error"] == "ConnectionFailed"
-
-
-def test_no_service(node: Node, service: Running) -> None:
-    (outcome,) = calls(
-        node,
-        service,
-        [{"call": "ready"}],
-        url=f"http://127.0.0.1:{free_port()}",
-        retries={"sendings": 1},
-    )
-    assert (outcome["error"], outcome["sent"]) == ("ConnectionFailed", False)
 
 
 def test_tokens(node: Node, service: Running) -> None:
