@@ -20,7 +20,7 @@ ACTIONS = {
     "get_audit_log": "audit-log",
     "create_token": "token",
     "import_subject": "import",
-    "unlock_subject": "unlock",
+    "unlock_subject": "lockout-reset",
 }
 """Actions of routes, by the name of their function, where they are called otherwise than it. All
 others have its name, with hyphens."""

@@ -41,6 +41,10 @@ _EMPTY_LOG = "PRAGMA wal_checkpoint(TRUNCATE)"
 PURGE_WAIT_S = 0.25
 """Longest that emptying SQLite's log waits for readers, and so makes writers wait."""
 _UNAVAILABLE_CLASSES = {"08", "53", "57", "58"}  # connection, resources, operator, system
+_TABLE_MISSING = (
+    "a table is missing: run `veilface db upgrade`; where that changes nothing, restore a backup, "
+    "or make the database anew if an unreleased state of the program made it"
+)
 _LOCK_NOT_AVAILABLE, _DEADLOCK, _SERIALISATION = "55P03", "40P01", "40001"
 
 # The server takes the columns in their order, so the limit, in milliseconds, holds for the lock.
@@ -251,7 +255,7 @@ def _translated(error: Exception) -> StoreError:
     if isinstance(cause, _POSTGRES):
         state = getattr(cause, "sqlstate", None) or ""
         if state == "42P01":
-            return StoreError("a table is missing: run `veilface db upgrade`")
+            return StoreError(_TABLE_MISSING)
         if state in (_LOCK_NOT_AVAILABLE, _DEADLOCK, _SERIALISATION):
             return StoreBusy("another write, or a command on whole tables, takes too long")
         # The server answers with a state; without one the connection failed.
@@ -267,7 +271,7 @@ def _translated(error: Exception) -> StoreError:
 def _sqlite_error(cause: sqlite3.Error) -> StoreError:
     code = getattr(cause, "sqlite_errorname", "")
     if "no such table" in str(cause):
-        return StoreError("a table is missing: run `veilface db upgrade`")
+        return StoreError(_TABLE_MISSING)
     if code.startswith(("SQLITE_CORRUPT", "SQLITE_NOTADB")):
         return StoreUnavailable("the SQLite file is damaged, or is not a database")
     if code.startswith("SQLITE_BUSY"):

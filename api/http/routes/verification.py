@@ -9,6 +9,11 @@ A locked subject's photo is not looked at. The lock is read first, and a subject
 whether or not somebody is enrolled under it. A template, or the stand-in, is opened before the
 photo is looked at, so that the time of a refused photo does not tell the two apart either.
 
+:meth:`templates.store.attempts.Attempts.decide` reads and writes; between the two it calls the
+``compare`` of :func:`_decide`. What runs before the route is not in its signature: unknown names
+are refused (``api.http.deps``), the key is recognised and counted, and its right asked for
+(``api.http.auth``).
+
 No decision leaves before that write has committed. So of requests that run at the same time
 no more are answered than of requests that come one after the other.
 """

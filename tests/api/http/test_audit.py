@@ -121,7 +121,11 @@ def test_refusals_are_written_with_their_code(service: tuple[Client, Deployment]
         ("enroll", "forbidden", lambda: client.put(f"{path}/enrollment", headers=bearer(verifier))),
         ("erase", "forbidden", lambda: client.delete(path, headers=bearer(verifier))),
         ("export", "forbidden", lambda: client.get(f"{path}/export", headers=bearer(verifier))),
-        ("unlock", "forbidden", lambda: client.delete(f"{path}/lockout", headers=bearer(verifier))),
+        (
+            "lockout-reset",
+            "forbidden",
+            lambda: client.delete(f"{path}/lockout", headers=bearer(verifier)),
+        ),
         ("audit-log", "forbidden", lambda: client.get("/v1/audit-log", headers=bearer(verifier))),
         (
             "list-subjects",
