@@ -101,10 +101,8 @@ def running(
         args.work.mkdir(parents=True, exist_ok=True)
         ours = {name: value for name, value in os.environ.items() if "VEILFACE_" not in name}
         env = ours | {
-            "VEILFACE_DATA_DIR": str(fresh),
+            "VEILFACE_DATA_DIR": str(args.work),
             "VEILFACE_DATABASE_URL": stack.enter_context(_database(args.database, fresh)),
-            "VEILFACE_DECOYS_FILE": str(args.work / "decoys.veil"),
-            "VEILFACE_CONTRACT_FILE": str(args.work / "contract.json"),
             "VEILFACE_MASTER_KEY_FILE": str(args.work / "master.key"),
             **UNLIMITED,
             **{f"VEILFACE_{name.upper()}": value for name, value in settings.items()},

@@ -229,7 +229,6 @@ def exercise(material: Material, folder: Path, *, database_url: str) -> ServiceT
         "VEILFACE_DATABASE_URL": database_url,
         "VEILFACE_PACK": str(material.pack_dir),
         "VEILFACE_LOG_LEVEL": "debug",
-        "VEILFACE_MAX_REQUEST_BYTES": str(3 * 1024 * 1024),
     }
     with (folder / "out").open("wb") as out, (folder / "err").open("wb") as err:
         process = subprocess.Popen(
@@ -446,7 +445,7 @@ def _send_bad_requests(traces: ServiceTraces, client: httpx.Client) -> None:
     enroll("no_face", files={"images": ("x.jpg", faceless.getvalue(), "image/jpeg")})
     enroll("unsupported_image", files={"images": ("x.jpg", photos[1].data[:3000], "image/jpeg")})
     enroll("malformed_request", files=form(photos[1]), data={"attributes": text})
-    enroll("request_too_large", files=form(material.large, material.large, material.large))
+    enroll("request_too_large", json={"template": 2 * b64(material.large.data)})
     enroll("enrollment_conflict", files=form(photos[1]), headers={"If-None-Match": "*"})
 
 

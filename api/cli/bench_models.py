@@ -1,8 +1,8 @@
 """``veilface bench models``: with which settings a pack answers soonest, and with which most often.
 
-Each graph is timed alone, and whole photos from their bytes to their embedding, sent by several
-callers at once through as many compute slots as a service would have. What is compared is timed in
-turn, so that what else the machine does meets it alike.
+Whole photos are timed from their bytes to their embedding, sent by several callers at once through
+as many compute slots as a service would have. What is compared is timed in turn, so that what else
+the machine does meets it alike.
 """
 
 import statistics
@@ -41,16 +41,13 @@ _embed = partial(ModelPack.embed_photo, policy=None, quality=None)
 class Row:
     """Whole photos with one setting: medians over the repeats.
 
-    ``compute_slots`` is at most ``callers``, since further slots would stay empty. ``p50_ms`` is
-    the time from a call to its embedding, the wait for a slot included.
+    ``p50_ms`` is the time from a call to its embedding, the wait for a slot included.
     """
 
     callers: int
     onnx_threads: int
     compute_slots: int
     photos_per_s: float
-    photos_per_s_low: float
-    photos_per_s_high: float
     p50_ms: float
     cpu_ms: float
 
@@ -66,13 +63,9 @@ def models(
         ),
     ] = None,
     threads: Annotated[
-        str | None,
-        typer.Option(
-            help="Values of `onnx_threads` to try beside its default. Unset: 1, 2, 4 and 8, as far "
-            "as there are processors.",
-            show_default=False,
-        ),
-    ] = None,
+        str,
+        typer.Option(help="Values of `onnx_threads` to try beside its default."),
+    ] = "1,2,4",
     repeats: Annotated[
         int, typer.Option(min=1, help="Timed repeats; medians of them are shown.")
     ] = 9,
@@ -87,8 +80,6 @@ def models(
     if settings.pack is None:
         raise UsageError("a pack is what is timed; name it with --pack")
     here = processors()
-    if threads is None:
-        threads = ",".join(str(count) for count in (1, 2, 4, 8) if count <= here)
     tried = listed_numbers(threads, "--threads", least=1, most=MAX_ONNX_THREADS)
     own = {str(path): read_photo(path) for path in photo or ()}
     packs = {
@@ -97,10 +88,11 @@ def models(
     }
     info = packs[DEFAULT_THREADS].info
     rows = time_photos(packs, own, repeats=repeats, here=here)
-    advised = advice(rows)
-    notice = demo_notice(info.embedder_sha256, n=info.n)
     columns = tuple(Row.__dataclass_fields__)
-    shown = [[_cell(getattr(row, name)) for name in columns] for row in rows]
+    cells = [
+        [f"{value:.2f}" if isinstance(value, float) else value for value in vars(row).values()]
+        for row in rows
+    ]
     return Result(
         {
             "pack": info.name,
@@ -108,42 +100,26 @@ def models(
             "providers": settings.providers,
             "repeats": repeats,
             "photos": rows,
-            "advice": advised,
-            **notice,
+            "advice": advice(rows, here=here),
+            **demo_notice(info.embedder_sha256, n=info.n),
         },
         [
-            Table(f"Whole photos, {info.name}", columns, shown),
+            Table(f"Whole photos, {info.name}", columns, cells),
             f"Medians of {repeats} repeats on {here} processors.",
-            advised,
+            advice(rows, here=here),
         ],
     )
-
-
-def _cell(value: float) -> str:
-    return f"{value:.2f}" if isinstance(value, float) else str(value)
 
 
 def time_photos(
     packs: Mapping[int, ModelPack], own: Mapping[str, bytes], *, repeats: int, here: int
 ) -> list[Row]:
-    """Time photos with all settings; the first round only fetches code and memory.
-
-    Parameters
-    ----------
-    packs
-        The pack by its number of threads.
-    own
-        Photos by their names; drawn ones where there are none.
-
-    Raises
-    ------
-    CommandError
-        A photo cannot be embedded, or the pack sees no face in what is drawn.
-    """
+    """Time photos, one's own by their names or drawn ones, with packs by their threads."""
     photos = _usable(packs[DEFAULT_THREADS], own)
     keys = [
         (callers, threads, slots)
         for callers, threads in product(sorted({1, here, 2 * here}), packs)
+        # Further slots than callers would stay empty.
         for slots in sorted({min(callers, max(1, s)) for s in (here // 2, here, 2 * here)})
     ]
     loads = np.empty((repeats + 1, len(keys), 3))
@@ -152,28 +128,18 @@ def time_photos(
             for place, (callers, threads, slots) in enumerate(keys):
                 turn[place] = _load(packs[threads], photos, callers=callers, slots=slots)
                 advance(1)
-    rates, waits, costs = loads[1:].transpose(2, 1, 0)
-    return [
-        Row(*key, float(np.median(rate)), float(rate.min()), float(rate.max()),
-            float(np.median(wait)), float(np.median(cost)))
-        for key, rate, wait, cost in zip(keys, rates, waits, costs, strict=True)
-    ]  # fmt: skip
+    # The first round only fetches code and memory.
+    medians = np.median(loads[1:], axis=0).tolist()
+    return [Row(*key, *median) for key, median in zip(keys, medians, strict=True)]
 
 
-def advice(rows: Sequence[Row]) -> str:
-    """Say which settings answer most photos a second at full load, and one photo soonest.
-
-    Medians decide; the defaults stand beside them.
-    """
+def advice(rows: Sequence[Row], *, here: int) -> str:
+    """Say which settings answer most photos a second at full load, and one photo soonest."""
     full = [row for row in rows if row.callers == max(row.callers for row in rows)]
     single = [row for row in rows if row.callers == 1]
     most = max(full, key=lambda row: row.photos_per_s)
     soonest = min(single, key=lambda row: row.p50_ms)
-    usual = next(
-        row
-        for row in full
-        if (row.onnx_threads, row.compute_slots) == (DEFAULT_THREADS, processors())
-    )
+    usual = next(r for r in full if (r.onnx_threads, r.compute_slots) == (DEFAULT_THREADS, here))
     alone = next(row for row in single if row.onnx_threads == DEFAULT_THREADS)
     return (
         f"onnx_threads = {most.onnx_threads} and compute_slots = {most.compute_slots} answer most "
@@ -188,7 +154,7 @@ def _load(
 ) -> tuple[float, float, float]:
     """Embed each photo equally often; photos a second, median ms of a call, processor ms."""
     calls = [*photos] * -(-callers * PHOTOS_EACH // len(photos))
-    # Who waits gets the next free slot in order of coming, as in the service.
+    # Calls get the next free slot in order of coming, as in the service.
     with ThreadPoolExecutor(slots) as computing, ThreadPoolExecutor(callers) as calling:
 
         def call(photo: bytes) -> float:

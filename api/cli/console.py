@@ -5,37 +5,19 @@ its exit status is an answer too. Rich is imported where something is drawn: mos
 speak, without it.
 """
 
-import json
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 
 import typer
 
-if TYPE_CHECKING:
-    from rich.progress import Progress
-    from rich.table import Table
-
 Advance = Callable[[int], None]
-
-_WIDTH_OF_A_FILE = 160  # where nobody looks at a terminal, tables are not squeezed to 80 columns
 
 
 def message(text: str) -> None:
     """Say something to the person; it does not disturb a program that reads stdout."""
     _write(text, err=True)
-
-
-def emit(value: Mapping[str, Any] | Sequence[Any]) -> None:
-    """Write one JSON value to stdout."""
-    say(as_json_text(value))
-
-
-def as_json_text(value: Mapping[str, Any] | Sequence[Any]) -> str:
-    """Write one JSON value as :func:`emit` does."""
-    return json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False)
 
 
 def say(text: str) -> None:
@@ -75,33 +57,6 @@ def counted(number: int, noun: str) -> str:
     return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
-def table(title: str, *columns: str) -> "Table":
-    """Make an empty table; numbers are the caller's to align."""
-    from rich.table import Table
-
-    made = Table(title=title, title_justify="left", title_style="bold")
-    for column in columns:
-        made.add_column(column, overflow="fold")
-    return made
-
-
-def show(*tables: "Table") -> None:
-    """Write tables to stdout."""
-    for listing in tables:
-        print_rich(listing)
-
-
-def print_rich(listing: "Table") -> None:
-    """Write a table to stdout; its cells are plain text, without markup."""
-    from rich.console import Console
-
-    width = None if sys.stdout.isatty() else _WIDTH_OF_A_FILE
-    console = Console(file=sys.stdout, width=width, markup=False)
-    with console.capture() as captured:
-        console.print(listing)
-    say(captured.get().removesuffix("\n"))
-
-
 def demo_notice(embedder_sha256: str, *, n: int) -> dict[str, str]:
     """Say so on stderr where the embedder is the demo model; the same as a part of JSON.
 
@@ -116,47 +71,46 @@ def demo_notice(embedder_sha256: str, *, n: int) -> dict[str, str]:
     return {"notice": DEMO_NOTICE}
 
 
-@contextmanager
-def progress(description: str, total: int | None) -> Iterator[Advance]:
-    """Show a progress bar on stderr while the block runs; call the result with what was done.
+def progress(description: str, total: int | None) -> AbstractContextManager[Advance]:
+    """Show on stderr how many of ``total`` things, such as photos, are done.
 
-    ``total`` counts things that a reader knows, such as photos. For work that has no such unit
-    there is :func:`share_done`.
+    The result is called with the number of things that were done since. For work that has no such
+    unit there is :func:`share_done`.
     """
-    with _bar("MofNCompleteColumn") as bar:
-        task = bar.add_task(description, total=total)
-        yield lambda done: bar.advance(task, done)
+    return _bar(description, total, "MofNCompleteColumn")
+
+
+def download(description: str, total: int | None) -> AbstractContextManager[Advance]:
+    """Show on stderr how many of ``total`` bytes have come; the result is called with more."""
+    return _bar(description, total, "DownloadColumn")
 
 
 @contextmanager
 def share_done(description: str) -> Iterator[Callable[[float], None]]:
     """Show per cent on stderr while the block runs; call the result with the share from 0 to 1."""
-    with _bar("TaskProgressColumn") as bar:
-        task = bar.add_task(description, total=1.0)
-        yield lambda share: bar.update(task, completed=share)
+    before = 0.0
+    with _bar(description, 1.0, "TaskProgressColumn") as advance:
+
+        def report(share: float) -> None:
+            nonlocal before
+            advance(share - before)
+            before = share
+
+        yield report
 
 
 @contextmanager
-def download(description: str) -> Iterator[Callable[[int | None], Advance]]:
-    """Show bytes on stderr while the block runs; call the result with their number, if known."""
-    with _bar("DownloadColumn") as bar:
-
-        def begin(total: int | None) -> Advance:
-            task = bar.add_task(description, total=total)
-            return lambda done: bar.advance(task, done)
-
-        yield begin
-
-
-def _bar(amount: str) -> "Progress":
+def _bar(description: str, total: float | None, amount: str) -> Iterator[Callable[[float], None]]:
     from rich import console, progress
 
     terminal = console.Console(stderr=True)
-    return progress.Progress(
+    with progress.Progress(
         progress.TextColumn("{task.description}"),
         progress.BarColumn(),
         getattr(progress, amount)(),
         progress.TimeRemainingColumn(),
         console=terminal,
         transient=not terminal.is_terminal,
-    )
+    ) as bar:
+        task = bar.add_task(description, total=total)
+        yield lambda done: bar.advance(task, done)

@@ -1,15 +1,13 @@
 """``veilface db``: the schema of the database, and its files."""
 
-import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from api.cli.console import emit, say
 from api.cli.errors import UsageError
-from api.cli.options import STORE, Tenant, takes_settings
-from api.cli.results import Result, reports
+from api.cli.options import STORE, Tenant
+from api.cli.results import Result, as_json, reports
 from api.http.audit import operator
 from api.http.receipts import receipt_json
 from api.service.opening import checked_store, open_keyring, open_store, retention_of
@@ -57,32 +55,21 @@ def upgrade(*, settings: Settings) -> Result:
 def check(*, settings: Settings) -> Result:
     """Check that the schema and the master key match; exit status 1 if they do not.
 
+    `--json` has the schema that the database is at, and the one that this version needs.
+
     Example: `veilface db check --data-dir veilface-data`
     """
     store = open_store(settings, open_keyring(settings))
+    facts = {"current": _revision(settings), "needed": head_revision()}
     try:
         store.check()
     except VeilfaceError as error:
-        return Result({"ok": False, "reason": str(error)}, error=str(error))
+        return Result({"ok": False, "reason": str(error), **facts}, error=str(error))
     finally:
         store.close()
     return Result(
-        {"ok": True, "reason": None},
+        {"ok": True, "reason": None, **facts},
         "The database has the right schema, and this is its master key.",
-    )
-
-
-@app.command()
-@reports("data_dir", "database_url")
-def current(*, settings: Settings) -> Result:
-    """Show which schema the database has and which one this version needs.
-
-    Example: `veilface db current --json`
-    """
-    revision, needed = _revision(settings), head_revision()
-    return Result(
-        {"current": revision, "needed": needed},
-        f"The database is at {revision or 'no schema yet'}; this version needs {needed}.",
     )
 
 
@@ -194,7 +181,7 @@ def template_enrollment(
 
 
 @app.command("erase-tenant")
-@takes_settings(*STORE)
+@reports(*STORE)
 def erase_tenant(
     tenant: Annotated[str, typer.Argument(help="The tenant's name.")],
     *,
@@ -209,7 +196,7 @@ def erase_tenant(
         Path | None,
         typer.Option(help="File for the receipt. Unset: it goes to stdout."),
     ] = None,
-) -> None:
+) -> Result:
     """Erase a tenant: its subjects, templates, keys and rotation; write a signed receipt.
 
     All of it in one transaction, for which other writes wait. Verify the receipt with
@@ -223,11 +210,12 @@ def erase_tenant(
         receipt = store.erasures.erase_tenant(tenant, by=operator()).receipt
     answer = receipt_json(receipt)
     if out is None:
-        emit(answer)
-        return
-    replace_private(out, json.dumps(answer, indent=2).encode())
+        return Result(answer, as_json(answer))
+    replace_private(out, as_json(answer).encode())
     counts = {item["item"]: item["count"] for item in receipt.claims["erased"]}
-    say(f"Erased tenant {tenant}: {counts.get('subjects', 0)} subjects. Receipt: {out}")
+    return Result(
+        answer, f"Erased tenant {tenant}: {counts.get('subjects', 0)} subjects. Receipt: {out}"
+    )
 
 
 def _revision(settings: Settings) -> str | None:

@@ -77,7 +77,7 @@ def _text(outcome: Outcome) -> list[str | Table]:
             ("level", "stated FMR", "genuine accepted", "impostors accepted"),
             [
                 (
-                    one.level,
+                    one.name,
                     f"{100 * one.fmr:g} %",
                     f"{one.genuine_accepted} of {one.genuine_trials}",
                     f"{one.impostors_accepted} of {one.impostor_trials}",
@@ -106,11 +106,6 @@ def _text(outcome: Outcome) -> list[str | Table]:
             ],
         ),
     ]
-    if outcome.locks_lifted:
-        text.append(
-            f"Five rejections in a row locked subjects {outcome.locks_lifted} times; each time the "
-            "demo lifted the lock, as an operator can."
-        )
     text += [f"Not usable, counted as rejected: {refusal}" for refusal in outcome.refused_photos]
     if outcome.receipt:
         text.append(

@@ -18,7 +18,6 @@ from models.pack import ModelPack
 from models.selection import FacePolicy
 from templates.contract.canonical import parse_object
 from templates.decoys import DecoyGenerator
-from templates.keys.holder_key import encode_holder_key, read_holder_key
 from templates.keys.private_file import replace_private
 from templates.space.agreement import InconsistentImages
 
@@ -75,12 +74,6 @@ def lift(
             "`single`, none."
         ),
     ] = FacePolicy.DOMINANT,
-    holder_key_file: Annotated[
-        Path | None,
-        typer.Option(
-            help="With `--out -`: private file with the holder's key, which the body will carry."
-        ),
-    ] = None,
 ) -> Result:
     """Make a private template from photos on this machine, without any secret of the service.
 
@@ -97,11 +90,6 @@ def lift(
         raise UsageError(f"a template is made from 1 to {MAX_PHOTOS} photos, not {len(photos)}")
     if level is not None and not (probe and str(out) == "-"):
         raise UsageError("--level goes with --probe --out -")
-    holder_key: dict[str, str] = {}
-    if holder_key_file is not None:
-        if str(out) != "-":
-            raise UsageError("--holder-key-file goes with --out -: a template's file has no key")
-        holder_key = {"holder_key": encode_holder_key(read_holder_key(holder_key_file))}
     public = read_contract(contract)
     if probe:
         m = public.probe_dimension(dim)
@@ -123,7 +111,7 @@ def lift(
     notice = demo_notice(info.embedder_sha256, n=info.n)
     if str(out) == "-":
         asked = {} if level is None else {"level": level}
-        body = {"template": base64.b64encode(data).decode("ascii"), **asked, **holder_key}
+        body = {"template": base64.b64encode(data).decode("ascii"), **asked}
         return Result(body, as_json(body))
     replace_private(out, data)
     kind = "probe" if probe else "enrollment"

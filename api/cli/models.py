@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from api.cli.console import counted, demo_notice, download, message
+from api.cli.console import counted, demo_notice, message
 from api.cli.errors import CommandError, UsageError
 from api.cli.pack_download import obtained, shown
 from api.cli.results import Result, Table, reports
@@ -103,8 +103,7 @@ def fetch(
         folder.mkdir(parents=True, exist_ok=True)
         digests = {}
         for source, pin in zip(sources, pins, strict=True):
-            with download("fetching") as begin:
-                digest, left_out = obtained(source, folder, sha256=pin, begin=begin)
+            digest, left_out = obtained(source, folder, sha256=pin)
             digests[shown(source)] = digest
             message(f"{shown(source)}: SHA-256 {digest}")
             if left_out:
@@ -117,7 +116,7 @@ def fetch(
         folder.rename(target)
     return Result(
         {"out": target, "sha256": digests, "pack": _described(pack)},
-        f"{target}: {_usable(pack.info)}",
+        f"{target}: {usable(pack.info)}",
     )
 
 
@@ -152,7 +151,8 @@ def _liveness_graphs(pack: ModelPack) -> tuple[Sequence[LivenessGraph], str | No
         return (), str(error)
 
 
-def _usable(info: PackInfo) -> str:
+def usable(info: PackInfo) -> str:
+    """Say what a pack gives, and what it takes."""
     detector = (
         "no detector: photos must be aligned square crops"
         if info.detector is None
@@ -177,11 +177,11 @@ def inspect(
     Example: `veilface models inspect ~/.insightface/models/buffalo_l`
     """
     graphs = inspect_pack(pack)
-    loaded: ModelPack | None
+    loaded, refusal = None, None
     try:
-        loaded, refusal = ModelPack.load(pack), ""
+        loaded = ModelPack.load(pack)
     except ModelError as error:
-        loaded, refusal = None, str(error)
+        refusal = str(error)
     text: list[str | Table] = [
         Table(
             f"Graphs of {pack.name}",
@@ -193,7 +193,7 @@ def inspect(
         text.append(f"This pack cannot be used: {refusal}")
     else:
         demo_notice(loaded.info.embedder_sha256, n=loaded.info.n)
-        text.append(f"Usable: {_usable(loaded.info)}")
+        text.append(f"Usable: {usable(loaded.info)}")
         members, unusable = _liveness_graphs(loaded)
         if unusable is not None:
             text.append(f"Its liveness graphs cannot be used: {unusable}")
@@ -207,7 +207,7 @@ def inspect(
     names = ("file", "role", "reason", "sha256", "inputs", "outputs")
     facts = {
         "usable": loaded is not None,
-        "reason": refusal or None,
+        "reason": refusal,
         "graphs": [{name: getattr(graph, name) for name in names} for graph in graphs],
         "pack": None if loaded is None else _described(loaded),
     }

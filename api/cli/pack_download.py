@@ -4,26 +4,24 @@ import hashlib
 import re
 import shutil
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import IO
 
 import httpx
 
+from api.cli.console import download
 from api.cli.errors import CommandError
 from models.archive import MAX_FILE_BYTES, is_archive, unpack
 
 TIMEOUT_S = 30.0
-_LOOPBACK = frozenset({"localhost", "127.0.0.1", "::1"})
+LOOPBACK = frozenset({"localhost", "127.0.0.1", "::1"})
 _GRAPH_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]*\.onnx", re.IGNORECASE)
-
-Begin = Callable[[int | None], Callable[[int], None]]
 
 
 def shown(source: str) -> str:
     """Write a source without what may be secret in an address: user, password and query."""
     text = source
-    if is_address(source):
+    if _is_address(source):
         try:
             url = httpx.URL(source)
             text = str(url.copy_with(username=None, password=None, query=None, fragment=None))
@@ -32,12 +30,7 @@ def shown(source: str) -> str:
     return "".join(c if c.isprintable() else "\ufffd" for c in text)
 
 
-def is_address(source: str) -> bool:
-    """Whether a source is an address, and not a file of this machine."""
-    return source.startswith(("http://", "https://"))
-
-
-def obtained(source: str, into: Path, *, sha256: str | None, begin: Begin) -> tuple[str, int]:
+def obtained(source: str, into: Path, *, sha256: str | None) -> tuple[str, int]:
     """Put the graphs of one source, an archive or a graph, into a folder.
 
     Parameters
@@ -46,9 +39,6 @@ def obtained(source: str, into: Path, *, sha256: str | None, begin: Begin) -> tu
         Address, or path of a file of this machine.
     sha256
         What the bytes must hash to, in hex; None for anything.
-    begin
-        Called with the number of bytes to come, where it is known; what it returns is called with
-        the number of bytes as they come.
 
     Returns
     -------
@@ -65,10 +55,12 @@ def obtained(source: str, into: Path, *, sha256: str | None, begin: Begin) -> tu
         The archive is not to be trusted.
     """
     with tempfile.NamedTemporaryFile(prefix=".draft-", dir=into) as draft:
-        if is_address(source):
-            _download(source, draft, is_pinned=sha256 is not None, begin=begin)
+        if _is_address(source):
+            _download(source, draft, is_pinned=sha256 is not None)
+        elif Path(source).is_file():
+            shutil.copyfile(source, draft.name)
         else:
-            _copy(Path(source), draft)
+            raise CommandError(f"{shown(source)} is neither an http(s) address nor a file")
         draft.flush()
         draft.seek(0)
         digest = hashlib.file_digest(draft, "sha256").hexdigest()
@@ -78,7 +70,7 @@ def obtained(source: str, into: Path, *, sha256: str | None, begin: Begin) -> tu
             )
         if is_archive(Path(draft.name)):
             return digest, len(unpack(Path(draft.name), into)[1])
-        name = Path(httpx.URL(source).path if is_address(source) else source).name
+        name = Path(httpx.URL(source).path if _is_address(source) else source).name
         if not _GRAPH_NAME.fullmatch(name):
             raise CommandError(
                 f"{shown(source)} is neither a zip archive nor an .onnx file with a name of "
@@ -90,21 +82,16 @@ def obtained(source: str, into: Path, *, sha256: str | None, begin: Begin) -> tu
         return digest, 0
 
 
-def _copy(file: Path, draft: IO[bytes]) -> None:
-    if not file.is_file():
-        raise CommandError(f"{shown(str(file))} is neither an http(s) address nor a file")
-    if file.stat().st_size > MAX_FILE_BYTES:
-        raise _too_large(str(file))
-    with file.open("rb") as source:
-        shutil.copyfileobj(source, draft)
+def _is_address(source: str) -> bool:
+    return source.startswith(("http://", "https://"))
 
 
-def _download(source: str, draft: IO[bytes], *, is_pinned: bool, begin: Begin) -> None:
+def _download(source: str, draft: IO[bytes], *, is_pinned: bool) -> None:
     try:
         with httpx.stream("GET", source, follow_redirects=True, timeout=TIMEOUT_S) as answer:
             hops = [*(hop.url for hop in answer.history), answer.url]
             if not is_pinned and any(
-                url.scheme != "https" and url.host not in _LOOPBACK for url in hops
+                url.scheme != "https" and url.host not in LOOPBACK for url in hops
             ):
                 raise CommandError(
                     f"{shown(source)} leads over plain http, where anybody on the way may change "
@@ -113,18 +100,16 @@ def _download(source: str, draft: IO[bytes], *, is_pinned: bool, begin: Begin) -
             if answer.status_code != httpx.codes.OK:
                 raise CommandError(f"{shown(source)} answers {answer.status_code}")
             size = answer.headers.get("content-length", "")
-            advance = begin(int(size) if size.isdecimal() else None)
-            for piece in answer.iter_bytes(2**18):
-                if draft.tell() + len(piece) > MAX_FILE_BYTES:
-                    raise _too_large(source)
-                draft.write(piece)
-                advance(len(piece))
+            with download("fetching", int(size) if size.isdecimal() else None) as advance:
+                for piece in answer.iter_bytes(2**18):
+                    if draft.tell() + len(piece) > MAX_FILE_BYTES:
+                        raise CommandError(
+                            f"{shown(source)} is larger than {MAX_FILE_BYTES:,} bytes: not a pack"
+                        )
+                    draft.write(piece)
+                    advance(len(piece))
     except (httpx.HTTPError, httpx.InvalidURL, ValueError) as error:
         raise CommandError(
             f"{shown(source)} cannot be fetched ({type(error).__name__}): look at it in a browser; "
             "without a network, bring the file here by other means, and name it with --from FILE"
         ) from None
-
-
-def _too_large(source: str) -> CommandError:
-    return CommandError(f"{shown(source)} is larger than {MAX_FILE_BYTES:,} bytes: not a pack")

@@ -1,9 +1,8 @@
 """Folders of photos that bulk commands are given; what is not read of them is named."""
 
-import csv
 import unicodedata
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from api.cli.console import message
@@ -11,7 +10,6 @@ from api.cli.errors import CommandError, UsageError
 from verify import LabelledFolder, labelled_folder
 from verify.datasets import SUFFIXES, distinct_files, is_photo, photos_alone, visible
 
-COLUMNS = ("subject", "photo")
 _MOST_NAMED = 5
 _ENDINGS = ", ".join(sorted(SUFFIXES))
 
@@ -60,75 +58,35 @@ def labelled_people(folder: Path) -> LabelledFolder:
     return replace(labelled, paths=paths, identities=identities)
 
 
-@dataclass(frozen=True)
-class Albums:
-    """Photos of people.
+def albums_of(folder: Path) -> tuple[dict[str, list[Path]], dict[str, str]]:
+    """Photos by subject id, of ``folder/Person/photo.jpg``; and why others cannot be enrolled.
 
-    Parameters
-    ----------
-    photos
-        By subject id. Names that are spellings of one id are one person.
-    left_out
-        Why nobody can be enrolled, by a name that breaks the rule or has no photo.
-    """
-
-    photos: Mapping[str, Sequence[Path]]
-    left_out: Mapping[str, str]
-
-
-def albums_of(source: Path) -> Albums:
-    """Photos by person, of ``source/Person/photo.jpg`` or of a CSV file with a photo on each line.
-
-    The file has the columns ``subject`` and ``photo``, a path relative to the file.
+    Names that are spellings of one id are one person.
 
     Raises
     ------
     UsageError
-        The file lacks a column, or a line a value.
+        It is no folder.
     DatasetError
         As of `verify.labelled_folder`.
     """
     # Imported here: most commands that read folders open no store, which takes seconds to load.
     from templates.store.identifiers import InvalidIdentifier, checked_subject_id
 
+    if not folder.is_dir():
+        raise UsageError(f"{folder} is not a folder")
     albums: dict[str, list[Path]] = {}
     left_out: dict[str, str] = {}
-    folders = [entry.name for entry in visible(source) if entry.is_dir()] if source.is_dir() else []
-    for name, photo in _named_photos(source):
+    labelled = labelled_people(folder)
+    for name, photo in zip(labelled.identities, labelled.paths, strict=True):
         try:
             albums.setdefault(checked_subject_id(name), []).append(photo)
         except InvalidIdentifier as error:
             left_out[name] = str(error)
-    for name in folders:
-        if unicodedata.normalize("NFC", name) not in albums:
-            left_out.setdefault(name, f"no photo that is read: photos end in {_ENDINGS}")
-    return Albums(albums, left_out)
-
-
-def _named_photos(source: Path) -> Iterator[tuple[str, Path]]:
-    """Yield each photo with the name that stands beside it."""
-    if source.is_dir():
-        labelled = labelled_people(source)
-        yield from zip(labelled.identities, labelled.paths, strict=True)
-        return
-    empty = True
-    try:
-        with source.open(encoding="utf-8-sig", newline="") as file:
-            rows = csv.DictReader(file)
-            if not set(COLUMNS) <= set(rows.fieldnames or ()):
-                raise UsageError(f"{source} needs a first line with the columns subject,photo")
-            for row in rows:
-                subject, photo = (row[name] for name in COLUMNS)
-                if not subject or not photo:
-                    raise UsageError(f"{source}, line {rows.line_num}: a subject and a photo")
-                empty = False
-                yield subject, source.parent / photo
-    except FileNotFoundError:
-        raise UsageError(f"{source} is neither a folder nor a CSV file") from None
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise UsageError(f"{source} cannot be read as CSV: {error}") from None
-    if empty:
-        raise UsageError(f"{source} names nobody")
+    for entry in visible(folder):
+        if entry.is_dir() and unicodedata.normalize("NFC", entry.name) not in albums:
+            left_out.setdefault(entry.name, f"no photo that is read: photos end in {_ENDINGS}")
+    return albums, left_out
 
 
 def people_or_faces(folder: Path) -> LabelledFolder:

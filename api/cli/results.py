@@ -7,6 +7,7 @@ flags for settings and ``--json``, shows the result, and sets the exit status.
 import dataclasses
 import inspect
 import json
+import sys
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from typing import Annotated, Any
 
 import typer
 
-from api.cli.console import message, print_rich, say
+from api.cli.console import message, say
 from api.cli.errors import UsageError
 from api.cli.options import AsJson, shown_as, takes_settings
 
@@ -87,6 +88,7 @@ def present(result: Result, *, json: bool) -> None:
 
 
 def _show(table: Table) -> None:
+    from rich.console import Console
     from rich.table import Table as Listing
 
     listing = Listing(title=table.title, title_justify="left", title_style="bold")
@@ -94,7 +96,12 @@ def _show(table: Table) -> None:
         listing.add_column(column, overflow="fold")
     for row in table.rows:
         listing.add_row(*map(str, row))
-    print_rich(listing)
+    # Where nobody looks at a terminal, tables are not squeezed to 80 columns.
+    width = None if sys.stdout.isatty() else 160
+    console = Console(file=sys.stdout, width=width, markup=False)
+    with console.capture() as captured:
+        console.print(listing)
+    say(captured.get().removesuffix("\n"))
 
 
 _AS_JSON = inspect.Parameter(

@@ -21,6 +21,7 @@ from api.cli.errors import CommandError, UsageError
 from api.cli.files import read_bounded
 from api.cli.inputs import load_decoys
 from api.cli.master_keys import is_from_file, opened_store
+from api.cli.models import usable
 from api.cli.photo_folders import find_photos, labelled_people
 from api.cli.results import Result, reports
 from api.cli.roles import Roles, assign_faces, assign_roles, resolved_rates, too_few
@@ -166,12 +167,9 @@ def _labelled(people: Path) -> LabelledFolder:
 
 
 def _say_plan(roles: Roles, pack: ModelPack) -> None:
-    detector = "no detector: photos must be aligned crops"
-    if pack.info.detector is not None:
-        detector = f"detector {pack.info.detector.kind}"
     adapted = f", adapted to {len(roles.sample):,} photos" if roles.sample else ""
     aside = f"; {roles.left_out:,} photos of people in another role left out"
-    message(f"... pack: {pack.info.name}, {pack.info.n} numbers per embedding, {detector}")
+    message(f"... pack: {pack.info.name}, {usable(pack.info)}")
     message(
         f"... roles: decoys of {len(roles.faces):,} faces{adapted}; thresholds on "
         f"{len(roles.calibration):,} people, {roles.photos:,} photos"

@@ -8,14 +8,11 @@ What is printed is computed from the answers and from the database's file; :attr
 holds whatever did not go as promised.
 """
 
-import contextlib
-import math
 import shutil
-import sqlite3
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -41,34 +38,20 @@ from verify import CalibrationOptions, LabelledFolder
 from verify.preparation import make_generator
 
 MARKER = "# Written by `veilface demo`, which replaces this folder when it runs again."
-# A run fails if the level's FMR makes so many accepted impostors less likely than this.
-LEAST_LIKELY = 1e-6
-"""Probability below which so many impostors are no chance: a sound demo does not fail by it."""
 
 Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
-class Person:
-    """One enrolled person, and how the service answered."""
+class Counts:
+    """How the service answered: attempts on one person, or at one security level."""
 
     name: str
     genuine_accepted: int
     genuine_trials: int
     impostors_accepted: int
     impostor_trials: int
-
-
-@dataclass(frozen=True)
-class LevelCount:
-    """What one security level did in the demo."""
-
-    level: str
     fmr: float
-    genuine_accepted: int
-    genuine_trials: int
-    impostors_accepted: int
-    impostor_trials: int
 
 
 @dataclass(frozen=True)
@@ -81,17 +64,16 @@ class Outcome:
     contract_id: str
     verdict: Verdict | None
     strategy: str
-    people: tuple[Person, ...]
-    levels: tuple[LevelCount, ...]
+    people: tuple[Counts, ...]
+    levels: tuple[Counts, ...]
     default_level: str
     stored: tuple[Stored, ...]
     erased: str
     receipt: dict[str, Any]
     rows_after_erasure: int
     refused_photos: tuple[str, ...]
-    locks_lifted: int
     seconds: float
-    faults: tuple[str, ...] = field(default=())
+    faults: tuple[str, ...]
 
 
 def run_demo(
@@ -118,11 +100,6 @@ def run_demo(
         Numbers of people and photos that are drawn.
     say
         Called with what is being done.
-
-    Raises
-    ------
-    StartError
-        One sentence on what is missing.
     """
     started = time.monotonic()
     if (pack is None) != (faces is None):
@@ -137,36 +114,17 @@ def run_demo(
         else:
             cast, decoy_photos, labelled = found_cast(faces, size)
         contract = _calibrate(folder, pack, decoy_photos, labelled, m=m, say=say)
-    _write_settings(folder, pack)
+    _write_settings(folder, pack, demo=is_demo_model(contract.binding.embedder_sha256))
     say("starting the service")
     with running_service(folder, create_key(folder)) as client:
         return _play(client, folder, pack, contract, cast, say=say, started=started)
 
 
-def _require_unserved(folder: Path) -> None:
-    """Refuse to remove a database that a service has open: it would go on as if it were there."""
-    path = folder / "veilface.db"
-    if not path.exists():
-        return
-    with contextlib.closing(sqlite3.connect(path, timeout=0)) as database:
-        try:
-            # SQLite leaves the write-ahead log only where no other connection is open.
-            database.execute("PRAGMA journal_mode = DELETE")
-        except sqlite3.OperationalError:
-            raise StartError(
-                f"{folder} is being served: stop `veilface serve` there, or choose another folder"
-            ) from None
-        except sqlite3.DatabaseError:
-            pass  # no database any more
-
-
 def _prepare_folder(folder: Path) -> None:
     settings = folder / "veilface.toml"
     if folder.exists() and any(folder.iterdir()):
-        ours = settings.is_file() and settings.read_text(encoding="utf-8").startswith(MARKER)
-        if not ours:
+        if not (settings.is_file() and settings.read_text(encoding="utf-8").startswith(MARKER)):
             raise StartError(f"{folder} is not empty and not a demo; choose another folder")
-        _require_unserved(folder)
         shutil.rmtree(folder)
     folder.mkdir(parents=True, exist_ok=True)
     # Written first, so that a demo that is interrupted can be replaced.
@@ -214,19 +172,18 @@ def _extract(pack: ModelPack, photos: Sequence[Path]) -> Extraction:
     return extraction
 
 
-def _write_settings(folder: Path, pack: Path) -> None:
+def _write_settings(folder: Path, pack: Path, *, demo: bool) -> None:
     values: dict[str, Value] = {
         "data_dir": folder,
         "master_key_file": folder / KEY_FILE,
         "pack": pack,
+        **({"demo": True} if demo else {}),
     }
-    comments = [
+    text = settings_text(
+        values,
         MARKER.removeprefix("# "),
         "The master key is beside the database only here: a deployment keeps the two apart.",
-    ]
-    if is_demo_model(ModelPack.load(pack, threads=1).info.embedder_sha256):
-        values["demo"] = True
-    text = settings_text(values, *comments)
+    )
     (folder / "veilface.toml").write_text(text, encoding="utf-8")
 
 
@@ -242,7 +199,6 @@ def _play(
 ) -> Outcome:
     say(f"enrolling {len(cast.enrolled)} people over HTTP")
     refused: list[str] = []
-    faults: list[str] = []
     enrolled: list[str] = []
     for name, photos in cast.enrolled.items():
         path = f"/v1/subjects/{name}/enrollment"
@@ -250,27 +206,31 @@ def _play(
         if answer.status_code == httpx.codes.CREATED:
             enrolled.append(name)
         else:
-            # A photo of the press may show two people of one size: no fault of the service.
-            is_refusal = answer.status_code == httpx.codes.UNPROCESSABLE_ENTITY
-            (refused if is_refusal else faults).append(f"{name} was not enrolled: {_code(answer)}")
+            refused.append(f"{name} was not enrolled: {_code(answer)}")
     if not enrolled:
-        raise StartError("nobody could be enrolled: " + "; ".join([*refused, *faults]))
+        raise StartError("nobody could be enrolled: " + "; ".join(refused))
     say("verifying genuine and impostor photos over HTTP")
-    levels = [level.name for level in contract.calibration("p2s").levels]
+    rates = {
+        level.name: level.fmr.value if level.target_fmr is None else level.target_fmr
+        for level in contract.calibration("p2s").levels
+    }
     default = contract.default_level
-    attempts, locks = _attempts(client, cast, enrolled, levels, refused)
+    attempts = _attempts(client, cast, enrolled, [*rates], refused)
+    at_default = [attempt for attempt in attempts if attempt.level == default]
     people = tuple(
-        Person(name, *_count(attempts, level=default, subject=name)) for name in cast.enrolled
+        _counts(name, rates[default], [a for a in at_default if a.subject == name])
+        for name in cast.enrolled
     )
-    counts = tuple(
-        LevelCount(level, _fmr(contract, level), *_count(attempts, level=level)) for level in levels
+    levels = tuple(
+        _counts(level, rate, [a for a in attempts if a.level == level])
+        for level, rate in rates.items()
     )
     stored = read_stored(folder, enrolled)
     say("erasing one person and checking the receipt")
     erased = enrolled[0]
-    receipt, erasure_faults = _erase(client, erased, cast.enrolled[erased][-1])
+    receipt, faults = _erase(client, erased, cast.enrolled[erased][-1])
     rows = rows_of(folder, erased)
-    faults += erasure_faults + _faults(people, counts)
+    faults += faults_of(people)
     if rows:
         faults.append(f"{rows} rows of {erased} are left in the database after the erasure")
     binding = contract.binding
@@ -282,14 +242,13 @@ def _play(
         verdict=contract.verdict,
         strategy=f"{binding.strategy}, m = {binding.m}, n = {binding.n}",
         people=people,
-        levels=counts,
+        levels=levels,
         default_level=default,
         stored=stored,
         erased=erased,
         receipt=receipt,
         rows_after_erasure=rows,
-        refused_photos=tuple(refused),
-        locks_lifted=locks,
+        refused_photos=tuple(dict.fromkeys(refused)),
         seconds=time.monotonic() - started,
         faults=tuple(faults),
     )
@@ -309,11 +268,10 @@ def _attempts(
     enrolled: Sequence[str],
     levels: Sequence[str],
     refused: list[str],
-) -> tuple[list[_Attempt], int]:
+) -> list[_Attempt]:
     """Show every probe photo to every enrolled subject, at every level.
 
-    An enrollment that was refused counts as failed genuine attempts of that person. So many
-    strangers lock every subject out; the lock is lifted as an operator would, and counted.
+    Somebody who was not enrolled, and a photo that cannot be used, count as rejected.
     """
     probes = [
         (name, photo)
@@ -328,33 +286,18 @@ def _attempts(
         for level in levels
         for _ in range(PROBE_PHOTOS)
     ]
-    lifted = 0
     for owner, photo in probes:
         for subject in enrolled:
             for level in levels:
                 path = f"/v1/subjects/{subject}/verify"
                 answer = _send(client, "POST", path, [photo], level=level, face=cast.face)
-                if answer.status_code == httpx.codes.LOCKED:
-                    lifted += _lift(client, subject)
-                    answer = _send(client, "POST", path, [photo], level=level, face=cast.face)
-                if answer.status_code != httpx.codes.OK:
-                    refusal = f"{owner}/{photo.name}: {_code(answer)}"
-                    if refusal not in refused:
-                        refused.append(refusal)
-                    # A genuine photo that cannot be used is a failed attempt of its owner.
-                    accepted = False
-                else:
+                accepted = False
+                if answer.status_code == httpx.codes.OK:
                     accepted = answer.json()["decision"] == "accept"
+                else:
+                    refused.append(f"{owner}/{photo.name}: {_code(answer)}")
                 attempts.append(_Attempt(subject, owner == subject, level, accepted))
-    for subject in enrolled:
-        _lift(client, subject)
-    return attempts, lifted
-
-
-def _lift(client: httpx.Client, subject: str) -> int:
-    """Lift the lockout of a subject; 1 if there was one."""
-    answer = client.delete(f"/v1/subjects/{subject}/lockout")
-    return int(answer.status_code == httpx.codes.OK and bool(answer.json()["lifted"]))
+    return attempts
 
 
 def _send(
@@ -362,11 +305,7 @@ def _send(
 ) -> httpx.Response:
     name = "images" if method == "PUT" else "image"
     files = [(name, (photo.name, photo.read_bytes())) for photo in photos]
-    answer = client.request(method, path, files=files, data=fields)
-    while answer.status_code == httpx.codes.TOO_MANY_REQUESTS:
-        time.sleep(int(answer.headers["Retry-After"]))
-        answer = client.request(method, path, files=files, data=fields)
-    return answer
+    return client.request(method, path, files=files, data=fields)
 
 
 def _code(answer: httpx.Response) -> str:
@@ -376,19 +315,10 @@ def _code(answer: httpx.Response) -> str:
         return f"status {answer.status_code}"
 
 
-def _count(
-    attempts: Sequence[_Attempt], *, level: str, subject: str | None = None
-) -> tuple[int, int, int, int]:
-    """Genuine accepted, genuine trials, impostors accepted, impostor trials."""
-    chosen = [a for a in attempts if a.level == level and subject in (None, a.subject)]
-    genuine = [a.accepted for a in chosen if a.genuine]
-    impostors = [a.accepted for a in chosen if not a.genuine]
-    return sum(genuine), len(genuine), sum(impostors), len(impostors)
-
-
-def _fmr(contract: Contract, name: str) -> float:
-    level = contract.calibration("p2s").level(name)
-    return level.fmr.value if level.target_fmr is None else level.target_fmr
+def _counts(name: str, fmr: float, attempts: Sequence[_Attempt]) -> Counts:
+    genuine = [attempt.accepted for attempt in attempts if attempt.genuine]
+    impostors = [attempt.accepted for attempt in attempts if not attempt.genuine]
+    return Counts(name, sum(genuine), len(genuine), sum(impostors), len(impostors), fmr)
 
 
 def _erase(client: httpx.Client, name: str, photo: Path) -> tuple[dict[str, Any], list[str]]:
@@ -406,23 +336,14 @@ def _erase(client: httpx.Client, name: str, photo: Path) -> tuple[dict[str, Any]
     return claims, faults
 
 
-def _faults(people: Sequence[Person], levels: Sequence[LevelCount]) -> list[str]:
-    faults = [
-        f"{person.name} was rejected in most genuine attempts"
-        for person in people
-        if 2 * person.genuine_accepted < person.genuine_trials
+def faults_of(people: Sequence[Counts]) -> list[str]:
+    """Say who was rejected, or taken for others, in most attempts."""
+    return [
+        f"{one.name} was rejected in most genuine attempts"
+        for one in people
+        if 2 * one.genuine_accepted < one.genuine_trials
+    ] + [
+        f"most impostors were accepted as {one.name}"
+        for one in people
+        if 2 * one.impostors_accepted > one.impostor_trials
     ]
-    for level in levels:
-        likelihood = at_least(level.impostors_accepted, level.impostor_trials, level.fmr)
-        if likelihood < LEAST_LIKELY:
-            faults.append(
-                f"level {level.level} accepted {level.impostors_accepted} of "
-                f"{level.impostor_trials} impostors, more than its FMR of {level.fmr:g} explains"
-            )
-    return faults
-
-
-def at_least(errors: int, trials: int, rate: float) -> float:
-    """Probability of ``errors`` or more among independent trials that err at ``rate``."""
-    fewer = (math.comb(trials, k) * rate**k * (1 - rate) ** (trials - k) for k in range(errors))
-    return max(0.0, 1.0 - math.fsum(fewer))

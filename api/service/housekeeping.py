@@ -27,15 +27,6 @@ async def purge_regularly(
 
     A failure is one log line: the next round tries again. Rounds vary by a tenth, so that workers
     that started together do not purge together.
-
-    Parameters
-    ----------
-    store
-        What is purged.
-    keep
-        How long subjects are kept.
-    on_failure
-        Is told the error of a round that failed.
     """
 
     def purge() -> None:

@@ -12,7 +12,7 @@ import logging
 import sys
 from typing import Any
 
-LOGGER = "veilface"
+LOGGER, UVICORN = "veilface", "uvicorn"
 FIELDS = frozenset(
     {
         "request_id",
@@ -71,15 +71,7 @@ class _ToStderr(logging.StreamHandler[Any]):
 
 
 def log(event: str, *, severity: int = logging.INFO, **fields: Any) -> None:
-    """Write one line.
-
-    Parameters
-    ----------
-    event
-        A fixed text, never built from input.
-    fields
-        Named in ``FIELDS``; None is left out.
-    """
+    """Write one line: a fixed text, never built from input, and fields named in ``FIELDS``."""
     unknown = set(fields) - FIELDS
     if unknown:
         raise ValueError(f"log fields that are not declared: {sorted(unknown)}")
@@ -88,31 +80,15 @@ def log(event: str, *, severity: int = logging.INFO, **fields: Any) -> None:
 
 
 def configure(level: str) -> None:
-    """Send our lines to stderr from now on; calling it again only changes the level."""
-    logger = logging.getLogger(LOGGER)
-    logger.setLevel(level.upper())
-    if not any(isinstance(handler, _ToStderr) for handler in logger.handlers):
-        handler = _ToStderr()
-        handler.setFormatter(JsonLines())
-        logger.addHandler(handler)
+    """Send our lines and uvicorn's to stderr from now on; again, it only changes the level.
 
-
-def uvicorn_log_config(level: str) -> dict[str, Any]:
-    """Logging configuration for uvicorn: the same JSON lines, and no access log."""
-    return {
-        "version": 1,
-        "disable_existing_loggers": False,
-        "formatters": {"json": {"()": "api.service.logging.JsonLines"}},
-        "handlers": {
-            "stderr": {
-                "class": "logging.StreamHandler",
-                "formatter": "json",
-                "stream": "ext://sys.stderr",
-            }
-        },
-        "loggers": {
-            "uvicorn": {"handlers": ["stderr"], "level": level.upper(), "propagate": False},
-            "uvicorn.error": {"level": level.upper()},
-            "uvicorn.access": {"handlers": [], "level": "CRITICAL", "propagate": False},
-        },
-    }
+    Of what uvicorn tells at the level `info`, each start and stop, our own lines say more.
+    """
+    for name, least in ((LOGGER, level), (UVICORN, "warning" if level == "info" else level)):
+        logger = logging.getLogger(name)
+        logger.setLevel(least.upper())
+        logger.propagate = name == LOGGER
+        if not any(isinstance(handler, _ToStderr) for handler in logger.handlers):
+            handler = _ToStderr()
+            handler.setFormatter(JsonLines())
+            logger.addHandler(handler)

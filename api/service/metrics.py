@@ -132,26 +132,14 @@ for _kind in LOCKOUTS:
 
 
 def step(name: str) -> AbstractContextManager[object]:
-    """Measure one step of a request, in a thread or across awaits: ``with step("decide"): …``.
-
-    Parameters
-    ----------
-    name
-        A fixed text: ``body``, ``photo``, ``decide``, … Each makes a series.
-    """
+    """Measure one step of a request, in a thread or across awaits: ``with step("decide"): …``."""
     return STEP_SECONDS.labels(name).time()
 
 
 def count_decision(*, accepted: bool, reason: str, level: str, probe: str) -> None:
-    """Count one verification, or comparison, that was decided.
+    """Count one decision; ``probe`` is ``photo``, ``frames``, ``embedding`` or ``template``.
 
-    Parameters
-    ----------
-    accepted, reason, level
-        The decision, ``match``, ``no_match`` or ``liveness``, and the security level of the
-        contract that it was made at.
-    probe
-        ``photo``, ``frames``, ``embedding`` or ``template``; ``comparison`` of two photos.
+    It is ``comparison`` where two photos were compared.
     """
     DECISIONS.labels("accept" if accepted else "reject", reason, level, probe).inc()
 

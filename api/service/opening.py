@@ -21,7 +21,7 @@ from models.errors import ModelError
 from models.pack import ModelPack
 from templates.contract.document import Contract
 from templates.decoys import DecoyGenerator, DecoyPool, load_source
-from templates.errors import ContractMismatch, SealError, StoreUnavailable, VeilfaceError
+from templates.errors import SealError, StoreUnavailable, VeilfaceError
 from templates.keys.sealing import KeyringSealer, MasterKeyring
 from templates.store import TemplateStore
 from templates.store.database import Database
@@ -32,43 +32,24 @@ from templates.store.schema import SecretRow
 LOCKOUT = LockoutPolicy()
 
 
-def database_in_use(url: str) -> bool:
-    """Tell whether a master key left its mark in the database; an absent SQLite file has none.
-
-    Tables of other applications in the same database are not looked at.
-
-    Raises
-    ------
-    StoreError
-        If the database does not answer.
-    """
-    if url.startswith("sqlite") and not Path(make_url(url).database or "").exists():
-        return False
-    database = Database(url)
-
-    def marked(connection: Connection) -> bool:
-        if not inspect(connection).has_table(SecretRow.__tablename__):
-            return False
-        return connection.execute(select(SecretRow.name).limit(1)).first() is not None
-
+@contextmanager
+def _start_error(sentence: str) -> Iterator[None]:
+    """Say, before what goes wrong in the block, which thing it is about."""
     try:
-        return database.read(marked)
-    finally:
-        database.close()
+        yield
+    except StartError:
+        raise
+    except StoreUnavailable as error:
+        raise DatabaseAway(f"{sentence}: {error}") from None
+    except (OSError, VeilfaceError, ModelError) as error:
+        raise StartError(f"{sentence}: {error}") from None
 
 
 @dataclass(eq=False)
 class Deployment:
     """What the files and the database of a deployment hold, without models.
 
-    Attributes
-    ----------
-    settings
-        What named them.
-    keyring
-        The master keys.
-    store, contract, source
-        The database, at this program's schema; the contract; the decoys of its axes.
+    The contract, the decoys on its axes, and the database at this program's schema.
     """
 
     settings: Settings
@@ -78,22 +59,15 @@ class Deployment:
     source: DecoyPool | DecoyGenerator
 
     @classmethod
-    def open(cls, settings: Settings, *, contract: Contract | None = None) -> Self:
-        """Open what the settings name.
-
-        Parameters
-        ----------
-        settings
-            What is opened.
-        contract
-            The settings' contract, if it is open already.
-
-        Raises
-        ------
-        StartError
-            One sentence on the first thing that is wrong.
-        """
-        keyring = open_keyring(settings)
+    def open(
+        cls,
+        settings: Settings,
+        *,
+        keyring: MasterKeyring | None = None,
+        contract: Contract | None = None,
+    ) -> Self:
+        """Open what the settings name; ``keyring`` and ``contract`` are open already, if given."""
+        keyring = keyring or open_keyring(settings)
         contract = contract or open_contract(settings, keyring)
         source = open_decoys(settings, keyring, contract)
         store = open_store(settings, keyring)
@@ -114,29 +88,54 @@ def open_keyring(settings: Settings) -> MasterKeyring:
     """Load the master keys, or create the first one while nothing is stored yet.
 
     They come from an environment variable or a file, whichever the settings name;
-    only the file is ever created.
-
-    Raises
-    ------
-    StartError
-        If they cannot be used; or the file is absent, and the database holds something or does
-        not answer.
+    only the file is ever created: never while the database holds something or does not answer.
     """
-    try:
-        if settings.master_key_variable is not None:
+    if settings.master_key_variable is not None:
+        with _start_error("the master keys cannot be used"):
             return MasterKeyring.from_environment(settings.master_key_variable)
-    except SealError as error:
-        raise StartError(f"the master keys cannot be used: {error}") from None
     path = settings.resolved_master_key_file
+    with _start_error(f"the master key file {path} cannot be used"):
+        if not path.exists():
+            _require_unused(settings.resolved_database_url, path)
+            try:
+                return MasterKeyring.create(path)
+            except SealError:
+                if not path.exists():
+                    raise
+                # Another process made it since we looked: its key is everybody's.
+        return MasterKeyring.load(path)
+
+
+def _require_unused(url: str, path: Path) -> None:
+    with _start_error(
+        f"there is no master key file {path}, and none is made while the database cannot be asked "
+        "whether it holds data under an earlier one"
+    ):
+        if database_in_use(url):
+            raise StartError(
+                f"the master key file {path} is missing, but the database holds data sealed "
+                "with it; put the file back from its copy"
+            )
+
+
+def database_in_use(url: str) -> bool:
+    """Tell whether a master key left its mark in the database; an absent SQLite file has none.
+
+    Tables of other applications in the same database are not looked at.
+    """
+    if url.startswith("sqlite") and not Path(make_url(url).database or "").exists():
+        return False
+    database = Database(url)
+
+    def marked(connection: Connection) -> bool:
+        if not inspect(connection).has_table(SecretRow.__tablename__):
+            return False
+        return connection.execute(select(SecretRow.name).limit(1)).first() is not None
+
     try:
-        if path.exists():
-            return MasterKeyring.load(path)
-        _require_unused(settings.resolved_database_url, path)
-        return _create_or_load(path)
-    except StartError:
-        raise
-    except (OSError, VeilfaceError) as error:
-        raise StartError(f"the master key file {path} cannot be used: {error}") from error
+        return database.read(marked)
+    finally:
+        database.close()
 
 
 def key_beside_database(settings: Settings) -> str | None:
@@ -155,40 +154,9 @@ def key_beside_database(settings: Settings) -> str | None:
     )
 
 
-def _require_unused(url: str, path: Path) -> None:
-    try:
-        in_use = database_in_use(url)
-    except (OSError, VeilfaceError) as error:
-        raise StartError(
-            f"there is no master key file {path}, and none is made while the database cannot be "
-            f"asked whether it holds data under an earlier one: {error}"
-        ) from error
-    if in_use:
-        raise StartError(
-            f"the master key file {path} is missing, but the database holds data sealed "
-            "with it; put the file back from its copy"
-        )
-
-
-def _create_or_load(path: Path) -> MasterKeyring:
-    try:
-        return MasterKeyring.create(path)
-    except SealError:
-        if not path.exists():
-            raise
-        # Another process made it since we looked: its key is everybody's.
-        return MasterKeyring.load(path)
-
-
 def open_store(settings: Settings, keyring: MasterKeyring) -> TemplateStore:
-    """Open the store; :func:`prepare_database` must have run once before.
-
-    Raises
-    ------
-    StartError
-        If the URL is wrong, or the SQLite file cannot be made.
-    """
-    try:
+    """Open the store; :func:`prepare_database` must have run once before."""
+    with _start_error("the database cannot be opened"):
         if settings.database_url is None:
             settings.data_dir.mkdir(parents=True, exist_ok=True)
         return TemplateStore(
@@ -196,8 +164,6 @@ def open_store(settings: Settings, keyring: MasterKeyring) -> TemplateStore:
             keyring,
             lockout=replace(LOCKOUT, after=settings.lockout_after),
         )
-    except (OSError, VeilfaceError) as error:
-        raise StartError(f"the database cannot be opened: {error}") from None
 
 
 @contextmanager
@@ -211,6 +177,15 @@ def checked_store(settings: Settings) -> Iterator[TemplateStore]:
         store.close()
 
 
+def prepare_database(store: TemplateStore) -> None:
+    """Bring the schema up to date, and hold the master key against it.
+
+    Several processes may do so at once; the command line does it before it starts workers.
+    """
+    with _start_error("the database cannot be used"):
+        store.upgrade()
+
+
 def retention_of(settings: Settings) -> Retention:
     """Return how long subjects are kept, by the settings."""
 
@@ -220,42 +195,15 @@ def retention_of(settings: Settings) -> Retention:
     return Retention(days(settings.retention_days), days(settings.retention_disuse_days))
 
 
-def prepare_database(store: TemplateStore) -> None:
-    """Bring the schema up to date, and hold the master key against it.
-
-    Several processes may do so at once; the command line does it before it starts workers.
-
-    Raises
-    ------
-    StartError
-        If the database does not answer, or belongs to another master key or a newer program.
-    """
-    try:
-        store.upgrade()
-    except StoreUnavailable as error:
-        raise DatabaseAway(f"the database cannot be used: {error}") from None
-    except VeilfaceError as error:
-        raise StartError(f"the database cannot be used: {error}") from None
-
-
 def open_contract(settings: Settings, keyring: MasterKeyring) -> Contract:
-    """Load the contract file.
-
-    Raises
-    ------
-    StartError
-        If the file is absent, broken, or sealed with another master key.
-    """
+    """Load the contract file."""
     path = settings.resolved_contract_file
     if not path.is_file():
         raise StartError(
             f"there is no contract file {path}; `veilface calibrate` writes one (setting data_dir)"
         )
-    try:
-        contract = Contract.load(path, file_sealer(keyring))
-    except (OSError, VeilfaceError) as error:
-        raise StartError(f"the contract file {path} cannot be used: {error}") from error
-    return contract
+    with _start_error(f"the contract file {path} cannot be used"):
+        return Contract.load(path, file_sealer(keyring))
 
 
 def weak_privacy(contract: Contract) -> str | None:
@@ -280,13 +228,7 @@ def weak_privacy(contract: Contract) -> str | None:
 
 
 def require_privacy(contract: Contract, settings: Settings) -> str | None:
-    """Return why privacy is not proven, or None; refuse the contract where the settings say so.
-
-    Raises
-    ------
-    StartError
-        Privacy is not proven, and ``require_private`` is set.
-    """
+    """Return why privacy is not proven, or None; with ``require_private``, refuse the contract."""
     why = weak_privacy(contract)
     if why is not None and settings.require_private:
         raise StartError(
@@ -299,82 +241,51 @@ def require_privacy(contract: Contract, settings: Settings) -> str | None:
 def open_decoys(
     settings: Settings, keyring: MasterKeyring, contract: Contract
 ) -> DecoyPool | DecoyGenerator:
-    """Load the decoy source that the contract is bound to, reduced to the contract's axes.
-
-    Raises
-    ------
-    StartError
-        If the file is absent or broken, is another source than the contract's, or was made
-        with another model or preprocessing.
-    """
+    """Load the decoy source that the contract is bound to, reduced to the contract's axes."""
     path = settings.resolved_decoys_file
     if not path.is_file():
         raise StartError(
             f"there is no decoys file {path}; `veilface decoys build` writes one (setting data_dir)"
         )
-    try:
+    with _start_error(f"the decoys file {path} cannot be used"):
         source = load_source(path, file_sealer(keyring)).reduced(contract.binding.axes)
-    except (OSError, VeilfaceError) as error:
-        raise StartError(f"the decoys file {path} cannot be used: {error}") from error
-    try:
+    with _start_error(f"the decoys file {path} is not the contract's"):
         contract.binding.require_source(source_id=source.source_id, made_with=source.made_with)
-    except ContractMismatch as error:
-        raise StartError(f"the decoys file {path} is not the contract's: {error}") from error
     return source
 
 
-def open_pack(settings: Settings, contract: Contract | None = None) -> ModelPack | None:
-    """Load the model pack and hold it against the contract; None when none is set.
-
-    Raises
-    ------
-    StartError
-        If the pack is broken, or its embedder is not the contract's.
-    """
+def open_pack(settings: Settings, contract: Contract) -> ModelPack | None:
+    """Load the model pack, hold it against the contract, and try it; None when none is set."""
     if settings.pack is None:
         return None
-    try:
+    with _start_error(f"the model pack {settings.pack} cannot be used"):
         pack = ModelPack.load(
             settings.pack,
             providers=settings.providers,
             threads=settings.onnx_threads,
-            flip=contract is not None and bool(contract.binding.preprocessing.get("flip")),
+            flip=bool(contract.binding.preprocessing.get("flip")),
         )
-    except (OSError, ModelError) as error:
-        raise StartError(f"the model pack {settings.pack} cannot be used: {error}") from error
-    if contract is not None:
-        try:
-            contract.binding.require_embedder(
-                embedder_sha256=pack.info.embedder_sha256,
-                preprocessing=pack.info.preprocessing,
-                n=pack.info.n,
-            )
-        except ContractMismatch as error:
-            raise StartError(
-                f"the pack {settings.pack} does not belong to the contract "
-                f"{settings.resolved_contract_file}: {error}"
-            ) from error
+    with _start_error(
+        f"the pack {settings.pack} does not belong to the contract "
+        f"{settings.resolved_contract_file}"
+    ):
+        contract.binding.require_embedder(
+            embedder_sha256=pack.info.embedder_sha256,
+            preprocessing=pack.info.preprocessing,
+            n=pack.info.n,
+        )
+    try_inference(pack)
     return pack
 
 
 def try_inference(pack: ModelPack) -> None:
-    """Run the whole pack once, on grey noise, so that a broken graph stops the start.
-
-    Raises
-    ------
-    StartError
-        If it fails, or gives something else than one finite unit vector.
-    """
+    """Run the whole pack once, on grey noise, so that a broken graph stops the start."""
     size = pack.crop_size
     noise = np.random.default_rng(0).integers(0, 256, (size, size, 3), dtype=np.uint8)
-    try:
+    with _start_error(f"the pack {pack.info.name} fails on its first picture"):
         if pack.info.detector is not None:
             pack.detect(noise)
         embedding = pack.embed(noise[None])
-    except ModelError as error:
-        raise StartError(
-            f"the pack {pack.info.name} fails on its first picture: {error}"
-        ) from error
     norm = float(np.linalg.norm(embedding))
     if embedding.shape != (1, pack.info.n) or not abs(norm - 1.0) < 1e-3:
         raise StartError(f"the pack {pack.info.name} does not give a unit vector")

@@ -58,13 +58,7 @@ class Readiness:
             self._fail("model", error)
 
     async def check(self) -> None:
-        """Ask the database, and try again what failed last.
-
-        Raises
-        ------
-        ApiError, StoreError, ModelError
-            ``overloaded``, ``store_unavailable``, ``model_unavailable``.
-        """
+        """Ask the database, and try again what failed last."""
         try:
             await self._gate.query(self._store.ping)
             if "store" in self._failed:

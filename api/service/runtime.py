@@ -9,9 +9,8 @@
 """
 
 import contextlib
-import threading
-from collections import OrderedDict
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal, Self
 
 from api.http.errors import ApiError
@@ -23,7 +22,6 @@ from api.service.opening import (
     open_contract,
     open_keyring,
     open_pack,
-    try_inference,
 )
 from api.service.served_graphs import served_graphs
 from api.service.stand_in import SealedStandIn
@@ -36,6 +34,7 @@ from templates.contract import wire
 from templates.contract.document import Contract
 from templates.errors import StoreBusy
 from templates.keys.rotation import TenantRotation
+from templates.keys.sealing import MasterKeyring
 from templates.store.audit_log import By
 from templates.store.secrets import SecretName
 from templates.store.subject_rows import Source, SubjectTemplate
@@ -48,15 +47,6 @@ READS = 3
 
 TENANTS_KEPT = 64
 """Tenants and epochs whose rotations a process keeps."""
-
-
-def _lacking(what: str) -> ApiError:
-    return ApiError(
-        "model_unavailable",
-        f"this service runs without a {what}: send templates, or ask its operator",
-        {},
-        {"Retry-After": "60"},
-    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,10 +65,6 @@ class Runtime(Deployment):
     pack: ModelPack | None
     operators_export_key: ExportKey | None
     image_limits = DEFAULT_LIMITS
-    _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
-    _tenants: OrderedDict[tuple[str, int], InRotation] = field(
-        default_factory=OrderedDict, repr=False
-    )
 
     def __post_init__(self) -> None:
         self.levels = Levels(self.contract, lowest=self.settings.lowest_level)
@@ -88,18 +74,27 @@ class Runtime(Deployment):
         self.stand_in = SealedStandIn(
             self.nobody, self.keyring, contract_id=self.contract.contract_id
         )
+        self._of = lru_cache(TENANTS_KEPT)(self._in_rotation)
 
     @classmethod
-    def open(cls, settings: Settings, *, contract: Contract | None = None) -> Self:
-        """Open what the settings name, the pack before the database, and run one inference."""
+    def open(
+        cls,
+        settings: Settings,
+        *,
+        keyring: MasterKeyring | None = None,
+        contract: Contract | None = None,
+    ) -> Self:
+        """Open what the settings name.
+
+        The pack comes first: no database is migrated for a service that does not start.
+        """
         keep_few_arenas(settings.resolved_compute_slots)
-        contract = contract or open_contract(settings, open_keyring(settings))
+        keyring = keyring or open_keyring(settings)
+        contract = contract or open_contract(settings, keyring)
         pack = open_pack(settings, contract)
-        if pack is not None:
-            try_inference(pack)
         file = settings.export_key_file
         export_key = None if file is None else ExportKey.from_file(file)
-        opened = Deployment.open(settings, contract=contract)
+        opened = Deployment.open(settings, keyring=keyring, contract=contract)
         return cls(**vars(opened), pack=pack, operators_export_key=export_key)
 
     @property
@@ -132,17 +127,10 @@ class Runtime(Deployment):
             # Between the two looks it was moved into a newer epoch.
         raise StoreBusy("the tenant's rotation is being renewed; send it again")
 
-    def _of(self, tenant: str, epoch: int) -> InRotation:
-        named = (tenant, epoch)
-        with self._lock:
-            kept = self._tenants.get(named)
-            if kept is not None:
-                self._tenants.move_to_end(named)
-                return kept
-        # Outside of the lock: it takes a query and a QR decomposition.
+    def _in_rotation(self, tenant: str, epoch: int) -> InRotation:
         key = self.store.tenants.rotation_key(tenant, epoch=epoch).key
         rotation = TenantRotation(key, self.contract.binding.axes)
-        made = InRotation(
+        return InRotation(
             rotation=rotation,
             enroller=Enroller(
                 self.contract,
@@ -152,21 +140,11 @@ class Runtime(Deployment):
             ),
             verifier=Verifier(self.contract, self.source, rotation=rotation),
         )
-        with self._lock:
-            self._tenants[named] = made
-            while len(self._tenants) > TENANTS_KEPT:
-                self._tenants.popitem(last=False)
-        return made
 
     def require_template_enrollment(self, tenant: str) -> None:
         """Refuse a template that a client made, unless the operator lets the tenant enroll them.
 
         Asked of the database every time, so that a change counts at once in all workers.
-
-        Raises
-        ------
-        ApiError
-            ``forbidden``.
         """
         if not self.store.tenants.get(tenant).template_enrollment:
             raise ApiError(
@@ -177,15 +155,14 @@ class Runtime(Deployment):
             )
 
     def required_pack(self) -> ModelPack:
-        """Return the pack.
-
-        Raises
-        ------
-        ApiError
-            ``model_unavailable``.
-        """
+        """Return the pack, or refuse what needs one."""
         if self.pack is None:
-            raise _lacking("model pack")
+            raise ApiError(
+                "model_unavailable",
+                "this service runs without a model pack: send templates, or ask its operator",
+                {},
+                {"Retry-After": "60"},
+            )
         return self.pack
 
     def put(
@@ -229,9 +206,8 @@ class Runtime(Deployment):
     def export(self, tenant: str, subject: str, *, by: By) -> bytes | None:
         """Return one subject, encrypted, without the tenant's rotation; None if there is none.
 
-        It stays turned by the holder's, whose key is not here.
-
-        Its line stands in the audit log before it is returned.
+        It stays turned by the holder's, whose key is not here. Its line stands in the audit log
+        before it is returned.
 
         Raises
         ------

@@ -15,18 +15,10 @@ from models.pack_graphs import locate
 
 @dataclass(frozen=True)
 class ServedGraph:
-    """One graph.
+    """One graph: name, SHA-256 (hexadecimal) and bytes of its file, its input in pixels.
 
-    Attributes
-    ----------
-    role, kind
-        Of a detector, `kind` says how its output is read.
-    file, sha256, size
-        Name, SHA-256 (hexadecimal) and bytes of its file.
-    input_size
-        Width and height in pixels.
-    path, modified_ns
-        Where the file is, and when it was changed last.
+    Of a detector, `kind` says how its output is read. `modified_ns` is when the file was changed
+    last.
     """
 
     role: Literal["detector", "embedder"]
@@ -39,13 +31,7 @@ class ServedGraph:
     modified_ns: int = field(repr=False)
 
     def require_unchanged(self) -> None:
-        """Refuse to give a file that is another one than at the start.
-
-        Raises
-        ------
-        ApiError
-            ``model_unavailable``.
-        """
+        """Refuse to give a file that is another one than at the start."""
         try:
             now = self.path.stat()
         except OSError:
@@ -60,13 +46,7 @@ class ServedGraph:
 
 
 def served_graphs(settings: Settings, pack: ModelPack | None) -> dict[str, ServedGraph]:
-    """Return the graphs by their hashes, the detector first; none where the setting is off.
-
-    Raises
-    ------
-    StartError
-        If there is no pack, or a file is not the one that was loaded.
-    """
+    """Return the graphs by their hashes, the detector first; none where the setting is off."""
     if not settings.serve_pack:
         return {}
     if pack is None or settings.pack is None:
@@ -75,20 +55,13 @@ def served_graphs(settings: Settings, pack: ModelPack | None) -> dict[str, Serve
         folder = locate(settings.pack)[0].folder
     except PackError as error:
         raise StartError(f"setting serve_pack: {error}") from None
-    detector, side = pack.info.detector, pack.crop_size
-    graphs = []
-    if detector is not None:
-        graphs.append(
-            _read(
-                folder / detector.file,
-                "detector",
-                detector.kind,
-                detector.sha256,
-                detector.input_size,
-            )
-        )
-    embedder = folder / pack.info.embedder_file
-    graphs.append(_read(embedder, "embedder", None, pack.info.embedder_sha256, (side, side)))
+    info, side = pack.info, pack.crop_size
+    graphs = [
+        _read(folder / info.embedder_file, "embedder", None, info.embedder_sha256, (side, side))
+    ]
+    if (found := info.detector) is not None:
+        file = folder / found.file
+        graphs.insert(0, _read(file, "detector", found.kind, found.sha256, found.input_size))
     return {graph.sha256: graph for graph in graphs}
 
 

@@ -21,7 +21,7 @@ from uvicorn.supervisors import Multiprocess, multiprocess
 from api.http.app import create_app
 from api.http.errors import DatabaseAway, StartError
 from api.http.protocol import Protocol
-from api.service.logging import configure, log, uvicorn_log_config
+from api.service.logging import configure, log
 from api.service.metrics import shared_directory
 from api.service.opening import Deployment
 from api.service.runtime import Runtime
@@ -40,23 +40,13 @@ CIPHERS = "ECDHE+AESGCM:ECDHE+CHACHA20"
 
 
 def run_server(deployment: Deployment, listener: socket.socket) -> None:
-    """Serve until told to stop.
+    """Serve until told to stop; exit with another status than 0 where a worker could not start.
 
-    Parameters
-    ----------
-    deployment
-        What is served. One worker, this process, answers with this :class:`Runtime` and closes it.
-        Several open their own of the same settings and contract, also one in place of one that
-        died.
-    listener
-        The socket to take connections from.
-
-    Raises
-    ------
-    SystemExit
-        With a status other than 0 where the service, or one of its workers, could not start.
+    One worker, this process, answers with the :class:`Runtime` that it is given, and closes it.
+    Several open their own of the same settings and contract, also one in place of one that died.
     """
     settings = deployment.settings
+    configure(settings.log_level)
     config = uvicorn.Config(**uvicorn_options(deployment))
     if isinstance(deployment, Runtime):
         server = uvicorn.Server(config)
@@ -64,7 +54,6 @@ def run_server(deployment: Deployment, listener: socket.socket) -> None:
             server.run([listener])
         failed = not server.started
     else:
-        configure(settings.log_level)
         with shared_directory():
             workers = _Workers(config, [listener])
             workers.run()
@@ -108,6 +97,7 @@ def _worker_app(settings: Settings, contract: Contract) -> FastAPI:
 
     It would hold the port otherwise, and a service that is started again could not listen.
     """
+    configure(settings.log_level)
     parent = multiprocessing.parent_process()
     assert parent is not None  # noqa: S101 - uvicorn starts workers as processes
     threading.Thread(target=_end_after, args=(parent,), daemon=True).start()
@@ -129,11 +119,6 @@ def open_patiently(settings: Settings, *, contract: Contract, stopping: threadin
 
     A worker in place of one that died does so: the others serve on, and say ``store_unavailable``,
     where one that could not start would stop them all.
-
-    Raises
-    ------
-    StartError
-        Anything but the database is wrong; or the database is away, and the worker is to stop.
     """
     while True:
         try:
@@ -161,7 +146,7 @@ def uvicorn_options(deployment: Deployment) -> dict[str, Any]:
         "app": app,
         "factory": True,
         "workers": settings.workers,
-        "log_config": uvicorn_log_config("warning" if settings.log_level == "info" else "info"),
+        "log_config": None,
         "access_log": False,
         "http": Protocol,
         "ws": "none",
@@ -176,13 +161,7 @@ def uvicorn_options(deployment: Deployment) -> dict[str, Any]:
 
 
 def listen(settings: Settings) -> socket.socket:
-    """Open the port: from now on, who connects waits for the first worker.
-
-    Raises
-    ------
-    StartError
-        The address is taken, or is not this machine's.
-    """
+    """Open the port; connections wait for the first worker from now on."""
     family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
     listener = socket.socket(family, socket.SOCK_STREAM)
     try:
@@ -199,13 +178,7 @@ def listen(settings: Settings) -> socket.socket:
 
 
 def tls_options(settings: Settings) -> dict[str, Any]:
-    """Return uvicorn's arguments for TLS, none where it is off, after a look at the files.
-
-    Raises
-    ------
-    StartError
-        If the key can be read by others, or certificate and key cannot be used.
-    """
+    """Return uvicorn's arguments for TLS, none where it is off, after a look at the files."""
     certificate, key = settings.tls_certificate, settings.tls_key
     if certificate is None or key is None:
         return {}

@@ -209,7 +209,7 @@ def test_a_contract_that_cannot_be_read_stops_no_audit(
 ) -> None:
     broken = tmp_path / "contract.json"
     broken.write_text("{", encoding="utf-8")
-    monkeypatch.setenv("VEILFACE_CONTRACT_FILE", str(broken))
+    monkeypatch.setattr(Settings, "resolved_contract_file", broken)
     found, said = planned(world, tmp_path, monkeypatch)
     assert found == ((DEFAULT_DIM,), "adversarial")
     assert said is not None

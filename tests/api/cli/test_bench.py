@@ -90,7 +90,7 @@ def test_a_pack_is_timed_with_every_setting_and_the_best_is_advised(pack, tmp_pa
     monkeypatch.setattr("api.cli.bench_models.processors", lambda: 2)
     own = tmp_path / "own.png"
     own.write_bytes(photo(1))
-    timed = (*MODELS, pack, "--repeats", "2", "--photo", own)
+    timed = (*MODELS, pack, "--repeats", "2", "--photo", own, "--threads", "2")
     shown = run(*timed, "--json")
     assert shown.status == 0, shown.stderr
     rows = shown.json["photos"]
@@ -101,7 +101,6 @@ def test_a_pack_is_timed_with_every_setting_and_the_best_is_advised(pack, tmp_pa
         for slots in (1, 2, 4)
         if slots <= callers
     ]
-    assert all(r["photos_per_s_low"] <= r["photos_per_s"] <= r["photos_per_s_high"] for r in rows)
     best = max((row for row in rows if row["callers"] == 4), key=lambda row: row["photos_per_s"])
     named = f"onnx_threads = {best['onnx_threads']} and compute_slots = {best['compute_slots']}"
     assert shown.json["advice"].startswith(named)
@@ -110,16 +109,15 @@ def test_a_pack_is_timed_with_every_setting_and_the_best_is_advised(pack, tmp_pa
     assert "soonest" in text.splitlines()[-1]
 
 
-def test_advice_names_what_is_best_at_full_load_and_alone(monkeypatch):
-    monkeypatch.setattr("api.cli.bench_models.processors", lambda: 2)
+def test_advice_names_what_is_best_at_full_load_and_alone():
     rows = [
-        Row(callers, threads, slots, rate, rate, rate, p50, 1.0)
+        Row(callers, threads, slots, rate, p50, 1.0)
         for callers, threads, slots, rate, p50 in [
             (1, 1, 1, 31.0, 32.0), (4, 1, 2, 24.0, 91.0), (1, 2, 1, 41.0, 24.0),
             (4, 1, 4, 31.2, 99.0), (4, 2, 1, 27.0, 10.0),
         ]
     ]  # fmt: skip
-    assert advice(rows) == (
+    assert advice(rows, here=2) == (
         "onnx_threads = 1 and compute_slots = 4 answer most photos a second here (31.2; 24.0 with "
         "the defaults); onnx_threads = 2 answers a single photo soonest (24.0 ms; 32.0 ms with the "
         "default)."

@@ -17,7 +17,6 @@ PROMISED = {
         "db upgrade",
         "db check",
         "db compact",
-        "db current",
     ),
     *("keys create", "keys list", "keys revoke", "keys master", "keys rotate", "keys rewrap"),
     *("keys verify-receipt", "keys rotate-tenant", "keys renew"),

@@ -11,7 +11,6 @@ from models.pack import ModelPack
 from templates.contract import wire
 from templates.contract.document import Binding, Contract
 from templates.decoys import DecoyGenerator
-from templates.keys.holder_key import encode_holder_key, write_holder_key
 from templates.keys.sealing import MasterKeyring
 from tests.api.cli.conftest import DIM, PROBE_DIM, key_file, run
 
@@ -59,15 +58,13 @@ def test_an_enrollment_holds_the_projection_of_the_photos_mean(world, lift, tmp_
     assert ran.json["kind"] == "enrollment"
 
 
-def test_a_probe_has_a_calibrated_dimension_and_goes_to_stdout(world, lift, tmp_path):
+def test_a_probe_has_a_calibrated_dimension_and_goes_to_stdout(world, lift):
     (photo,) = world.photos(1, range(1))
-    key = tmp_path / "me.key"
-    write_holder_key(key, bytes(range(32)))
-    ran = lift(photo, "--probe", "--out", "-", "--level", "fmr-1e-2", "--holder-key-file", key)
+    ran = lift(photo, "--probe", "--out", "-", "--level", "fmr-1e-2")
     assert ran.status == 0
     sent = ran.json
     assert wire.decode(base64.b64decode(sent.pop("template"))).subspace.m == PROBE_DIM
-    assert sent == {"level": "fmr-1e-2", "holder_key": encode_holder_key(bytes(range(32)))}
+    assert sent == {"level": "fmr-1e-2"}
 
 
 @pytest.mark.parametrize(
@@ -75,7 +72,6 @@ def test_a_probe_has_a_calibrated_dimension_and_goes_to_stdout(world, lift, tmp_
     [
         (("--dim", "5"), 2, "add --probe"),
         (("--probe", "--level", "fmr-1e-2"), 2, "--level goes with --probe --out -"),
-        (("--holder-key-file", "none"), 2, "--holder-key-file goes with --out -"),
         (("--probe", "--dim", "5"), 1, f"of dimension {PROBE_DIM}, not 5"),
     ],
 )

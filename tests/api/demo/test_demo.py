@@ -1,23 +1,17 @@
 """The demo, at a small scale, through its real process and HTTP."""
 
-import contextlib
 import json
-import sqlite3
 import stat
-from math import isclose
 
 import pytest
-from scipy.stats import binom
 
 from api.demo.people import Scale
-from api.demo.run import LevelCount, Person, _faults, at_least, run_demo
+from api.demo.run import Counts, faults_of, run_demo
 from api.http.errors import StartError
 from models.demo import DEMO_NOTICE
 from models.pack_graphs import Role, inspect
 from tests.api.cli.conftest import run
 
-# Strangers come last. With four, no single one that is accepted by chance keeps both of the first
-# two subjects from five rejections in a row.
 SMALL = Scale(
     enrolled=3, strangers=4, decoy_people=150, calibration_people=50, calibration_photos=4
 )
@@ -40,7 +34,6 @@ def test_it_accepts_the_enrolled_and_rejects_the_others(played):
     assert all(person.impostor_trials == 2 * 2 + 4 for person in outcome.people)
     assert sum(person.genuine_accepted for person in outcome.people) >= 5
     assert "starting the service" in said
-    assert outcome.locks_lifted >= 1
     assert outcome.refused_photos == ()
 
 
@@ -89,21 +82,6 @@ def test_it_replaces_its_own_folder_and_no_other(played, tmp_path):
     assert ran.stdout == ""
 
 
-def test_a_folder_that_is_being_served_is_not_replaced(tmp_path, monkeypatch):
-    folder = tmp_path / "demo"
-    monkeypatch.setattr("api.demo.run.build_demo_pack", lambda _: 1 / 0)
-    with pytest.raises(ZeroDivisionError):
-        run_demo(folder, scale=SMALL)
-    with contextlib.closing(sqlite3.connect(folder / "veilface.db")) as served:
-        served.execute("PRAGMA journal_mode = WAL")
-        served.execute("CREATE TABLE subjects (id)")
-        with pytest.raises(StartError, match="is being served"):
-            run_demo(folder, scale=SMALL)
-    with pytest.raises(ZeroDivisionError):
-        run_demo(folder, scale=SMALL)
-    assert not (folder / "veilface.db").exists()
-
-
 def test_a_pack_without_faces_is_refused(tmp_path):
     ran = run("demo", "--folder", tmp_path / "new", "--pack", tmp_path)
     assert ran.status == 1
@@ -125,20 +103,13 @@ def test_the_command_prints_tables_and_the_notice(played, monkeypatch):
 
 
 def test_it_fails_when_it_should():
-    good = Person("a", 1, 2, 0, 50)
-    rejected = Person("b", 0, 2, 0, 50)
-    assert _faults([good], [LevelCount("fmr-1e-2", 0.01, 2, 2, 3, 100)]) == []
-    assert "b was rejected" in _faults([good, rejected], [])[0]
-    lax = LevelCount("fmr-1e-3", 0.001, 2, 2, 5, 160)
-    assert "accepted 5 of 160 impostors" in _faults([good], [lax])[0]
-    unlucky = LevelCount("fmr-1e-3", 0.001, 2, 2, 4, 160)
-    assert _faults([good], [unlucky]) == []
-
-
-@pytest.mark.parametrize(("errors", "trials", "rate"), [(0, 10, 0.1), (3, 160, 0.01), (1, 5, 0.5)])
-def test_the_binomial_tail(errors, trials, rate):
-    expected = binom.sf(errors - 1, trials, rate)
-    assert isclose(at_least(errors, trials, rate), expected, rel_tol=1e-9)
+    good, lax = Counts("a", 1, 2, 0, 50, 0.01), Counts("c", 2, 2, 26, 50, 0.01)
+    rejected = Counts("b", 0, 2, 0, 50, 0.01)
+    assert faults_of([good]) == []
+    assert faults_of([good, rejected, lax]) == [
+        "b was rejected in most genuine attempts",
+        "most impostors were accepted as c",
+    ]
 
 
 @pytest.mark.long

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from api.service.logging import FIELDS, JsonLines, configure, log, uvicorn_log_config
+from api.service.logging import FIELDS, JsonLines, configure, log
 from tests.api.calls import b64, lifted
 from tests.api.client import Client
 from tests.api.deployment import Deployment, N, bearer, images, photo, unit
@@ -162,9 +162,3 @@ def test_severity_is_a_threshold(monkeypatch: pytest.MonkeyPatch) -> None:
     finally:
         logger.setLevel(before)
     assert [json.loads(line)["event"] for line in out.getvalue().splitlines()] == ["loud"]
-
-
-def test_uvicorn_writes_no_access_log() -> None:
-    config = uvicorn_log_config("info")
-    assert config["loggers"]["uvicorn.access"]["handlers"] == []
-    assert config["formatters"]["json"]["()"] == "api.service.logging.JsonLines"

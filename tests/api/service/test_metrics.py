@@ -170,11 +170,7 @@ def test_a_failed_purge_is_counted() -> None:
                 failures.append(error)
                 purging.cancel()
 
-            await purge_regularly(
-                Broken(),  # type: ignore[arg-type]
-                every_s=60,
-                on_failure=failed,
-            )
+            await purge_regularly(Broken(), on_failure=failed)  # type: ignore[arg-type]
 
     anyio.run(scenario)
     after = value(samples(exposition().decode()), "veilface_purge_failures_total")
