@@ -133,8 +133,8 @@ def fairface(
 ) -> Result:
     """Infer gender, race and age from templates: the paper's experiment, and stronger attackers.
 
-    Writes report.json, report.md, figures, the paper's among them, and report.html, which has all
-    in one file, to --out. "The contract" is that in `data_dir` where it is of these decoys. Exit
+    Writes report.json, report.md and figures, the paper's among them, to --out. "The contract" is
+    that in `data_dir` where it is of these decoys. Exit
     status 1: the strongest attacker exceeds the limit; 3: none does, and too few faces show it.
     docs/privacy.md explains every figure.
 

@@ -9,7 +9,6 @@ import typer
 
 from api.cli.console import demo_notice, message
 from api.cli.errors import FAILED, UsageError
-from api.cli.html_report import write_html
 from api.cli.results import Result, Table
 from api.settings import Settings
 from attacks.report import RESULTS, Document
@@ -38,10 +37,6 @@ Limits = Annotated[
 
 NOT_SHOWN = 3
 """Exit status where nothing fails, and not everything is shown to hold."""
-CAPTIONS = {
-    "figure": "Attributes inferred from templates, by dimension",
-    "oracle": "What the paper's oracle gets",
-}
 
 
 def limits_of(given: Sequence[str] | None) -> dict[str, float]:
@@ -69,7 +64,7 @@ def limits_of(given: Sequence[str] | None) -> dict[str, float]:
 
 
 def write_report(report: Document, out: Path) -> list[Path]:
-    """Write the document, its Markdown, its figures and its HTML; return their files."""
+    """Write the document, its Markdown and its figures; return their files."""
     # Imported here: drawing loads a library that nothing else needs.
     from attacks.figures import write_figures
 
@@ -77,10 +72,8 @@ def write_report(report: Document, out: Path) -> list[Path]:
     files = [out / "report.json", out / "report.md"]
     text = json.dumps(report, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
     replace_public(files[0], text.encode())
-    written = markdown(report)
-    replace_public(files[1], written.encode())
-    figures = write_figures(report, out)
-    return [*files, *figures, write_html(out / "report.html", written, figures, CAPTIONS)]
+    replace_public(files[1], markdown(report).encode())
+    return [*files, *write_figures(report, out)]
 
 
 def model_json(pack: ModelPack) -> dict[str, Any]:
@@ -101,7 +94,6 @@ def reported(report: Document, out: Path, pack: ModelPack) -> Result:
             *(f"For comparison: {sentence}" for sentence in report["comparison_headlines"]),
             *(one for one in tables if one.rows),  # a line above says so of the others
             f"{out}: {', '.join(files)}.",
-            f"To read it: {out / 'report.html'}",
         ],
         status={True: 0, False: FAILED, None: NOT_SHOWN}[report["passed"]],
     )

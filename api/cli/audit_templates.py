@@ -109,7 +109,7 @@ def templates(
 ) -> Result:
     """Attack private templates: inversion, linkage, renewal, impersonation.
 
-    Writes report.json, report.md, figures and report.html, which has all in one file, to --out.
+    Writes report.json, report.md and figures to --out.
     Without --contract, --strategy, --dim and --axes are those of the contract in `data_dir` where
     it is of these decoys. Exit status 1: an attack exceeds its limit; 3: none does, and too few
     people or faces show it. docs/privacy.md leads to what each attack is.

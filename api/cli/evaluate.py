@@ -16,7 +16,7 @@ from api.cli.evaluation_inputs import (
     open_sources,
     wants_raw_flip,
 )
-from api.cli.evaluation_report import CAPTIONS, write_results
+from api.cli.evaluation_report import write_results
 from api.cli.inputs import listed, named_file
 from api.cli.options import PROCESSOR, Device, chosen_device, quick
 from api.cli.results import Plan, Result, Table, reports
@@ -140,8 +140,8 @@ def evaluate(
 ) -> Result:
     """Evaluate face verification with private templates: the LFW / CFP / AgeDB protocol.
 
-    Writes results.json, results.csv, results.md, figures (PNG and SVG) and results.html, which has
-    all in one file, to --out. docs/evaluation.md explains every figure.
+    Writes results.json, results.csv, results.md and figures (PNG and SVG) to --out.
+    docs/evaluation.md explains every figure.
 
     Example: `veilface evaluate lfw.bin --pack buffalo_l --decoys decoys.veil --out lfw-results`
     """
@@ -206,7 +206,7 @@ def evaluate(
         },
     )
     drawings = {"figure": verification_figure, "det": det_figure}
-    written = write_results(results, markdown(results), drawings, CAPTIONS, out)
+    written = write_results(results, markdown(results), drawings, out)
     notice = {}
     if isinstance(embedder, PackEmbedder):
         info = embedder.pack.info
@@ -217,7 +217,6 @@ def evaluate(
             *(_summary(results, dataset["name"]) for dataset in results["datasets"]),
             *(f"Not reported: {sentence}." for sentence in results["refused"]),
             f"{out}: {', '.join(path.name for path in written)}.",
-            f"To read it: {out / 'results.html'}",
         ],
     )
 

@@ -8,7 +8,7 @@ import typer
 from api.cli.console import demo_notice, message, progress
 from api.cli.descriptors import BULK, bulk_pack
 from api.cli.errors import CommandError, UsageError, require_extra
-from api.cli.evaluation_report import LIVENESS_CAPTIONS, write_results
+from api.cli.evaluation_report import write_results
 from api.cli.inputs import listed, load_decoys
 from api.cli.results import Plan, Result, Table, reports
 from api.service.opening import file_sealer, open_keyring
@@ -72,8 +72,8 @@ def evaluate_liveness(
     """Evaluate the pack's liveness graphs on live and attack photos (ISO/IEC 30107-3).
 
     Reports APCER by species, BPCER, photos without a face and, with a contract, its decoys and
-    subjects, IAPMR. Writes results.json, results.csv, results.md, a DET figure and results.html to
-    --out. docs/liveness.md says what such graphs cannot see.
+    subjects, IAPMR. Writes results.json, results.csv, results.md and a DET figure to --out.
+    docs/liveness.md says what such graphs cannot see.
 
     Example: `veilface evaluate liveness photos --pack buffalo_l --contract contract.json
     --out liveness-results`
@@ -114,9 +114,7 @@ def evaluate_liveness(
         refused=refused,
     )
     out.mkdir(parents=True, exist_ok=True)
-    written = write_results(
-        results, markdown(results), {"det": liveness_figure}, LIVENESS_CAPTIONS, out
-    )
+    written = write_results(results, markdown(results), {"det": liveness_figure}, out)
     notice = demo_notice(pack.info.embedder_sha256, n=pack.info.n)
     facts = results["verification"]
     return Result(
@@ -126,7 +124,6 @@ def evaluate_liveness(
             *([] if facts["measured"] else [f"IAPMR was not measured: {facts['reason']}."]),
             *(f"Not reported: {sentence}." for sentence in refused),
             f"{out}: {', '.join(path.name for path in written)}.",
-            f"To read it: {out / 'results.html'}",
         ],
     )
 

@@ -5,7 +5,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from api.cli.html_report import write_html
 from templates.keys.private_file import replace_public
 from verify.evaluation.plan import Json
 from verify.evaluation.tables import write_csv
@@ -13,33 +12,13 @@ from verify.evaluation.tables import write_csv
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-CAPTIONS = {
-    "figure": "Accuracy by lifting and dimension, beside that of raw embeddings",
-    "det": "False non-matches over false matches (DET)",
-}
-LIVENESS_CAPTIONS = {"det": "Attacks taken for live over live photos taken for attacks (DET)"}
-
 
 def write_results(
-    results: Json,
-    report: str,
-    drawings: Mapping[str, Callable[[Json], "Figure | None"]],
-    captions: Mapping[str, str],
-    out: Path,
+    results: Json, report: str, drawings: Mapping[str, Callable[[Json], "Figure | None"]], out: Path
 ) -> list[Path]:
-    """Write the document, its rows as CSV, its report, the figures and the HTML.
+    """Write the document, its rows as CSV, its report in Markdown and the figures.
 
-    Parameters
-    ----------
-    report
-        In Markdown.
-    drawings, captions
-        By the name of a figure: what draws it, None where the results have nothing for it, and
-        what it shows.
-
-    Returns
-    -------
-    The files written.
+    ``drawings`` draw a figure by its name; None where the results have nothing for it.
     """
     # Imported here: drawing loads a library that nothing else needs.
     from verify.evaluation.figures.style import write
@@ -56,4 +35,4 @@ def write_results(
             (out / f"{name}{suffix}").unlink(missing_ok=True)
         figure = draw(results)
         figures += [] if figure is None else write(figure, out, name)
-    return [*files, *figures, write_html(out / "results.html", report, figures, captions)]
+    return [*files, *figures]

@@ -24,7 +24,7 @@ CONTRACT = {
 }
 FILES = [
     *("results.json", "results.csv", "results.md"),
-    *("figure.png", "figure.svg", "det.png", "det.svg", "results.html"),
+    *("figure.png", "figure.svg", "det.png", "det.svg"),
 ]
 
 

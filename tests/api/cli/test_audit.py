@@ -84,7 +84,7 @@ def face_report(faces: FaceAudit) -> Any:
 
 
 def test_an_audit_of_faces_writes_report_and_figures(faces: FaceAudit, face_report: Any) -> None:
-    files = ["report.json", "report.md", *both(["figure"]), "report.html"]
+    files = ["report.json", "report.md", *both(["figure"])]
     assert sorted(file.name for file in faces.out.iterdir()) == sorted(files)
     are_pictures(faces.out, ["figure"])
     said = faces.first.json
@@ -176,7 +176,7 @@ def test_the_seed_gives_the_rows_and_a_kept_limit_is_status_0(
     assert report["rows"] == face_report["rows"]
     assert report["outcomes"] == face_report["outcomes"]
     written = {file.name for file in (faces.root / "again").iterdir()}
-    assert written == {"report.json", "report.md", "report.html", *both(["figure"])}
+    assert written == {"report.json", "report.md", *both(["figure"])}
 
 
 def test_only_the_photos_that_the_limits_ask_for_are_embedded(

@@ -46,8 +46,8 @@ def test_what_is_not_judged_stands_before_all_tables(
     assert shown.startswith("PASSED adversarial, m = 16, generated decoys: " + named)
     assert shown.index(named) < shown.index("Verdict on")
     assert named in json.loads((tmp_path / "report.json").read_text())["headlines"][0]
-    page = (tmp_path / "report.html").read_text()
-    assert page.index(named) < page.index("<h2>")
+    page = (tmp_path / "report.md").read_text()
+    assert page.index(named) < page.index("\n## ")
 
 
 def test_an_audit_that_judged_nothing_says_so_and_does_not_end_with_success(
@@ -62,6 +62,6 @@ def test_an_audit_that_judged_nothing_says_so_and_does_not_end_with_success(
     assert "FAILED" not in shown
     assert "Verdict on" not in shown
     assert json.loads((tmp_path / "report.json").read_text())["passed"] is None
-    page = (tmp_path / "report.html").read_text()
-    assert page.index(said) < page.index("<h2>")
+    page = (tmp_path / "report.md").read_text()
+    assert page.index(said) < page.index("\n## ")
     assert "FAILED" not in page

@@ -136,7 +136,7 @@ def test_what_is_reported_is_what_the_scores_and_the_verifier_say(
     assert {**results, **said} == ran.json
     assert sorted(ran.json["files"]) == sorted(path.name for path in out.iterdir())
     assert {path.name for path in out.iterdir()} == {
-        *("results.json", "results.csv", "results.md", "det.png", "det.svg", "results.html")
+        *("results.json", "results.csv", "results.md", "det.png", "det.svg")
     }
     of = scores(liveness_pack, photos)
     live = [value for name, value in of.items() if name.startswith("live/")]
