@@ -2,8 +2,7 @@
 
 They come, strongest first, from flags (arguments of :class:`Settings`), from environment
 variables ``VEILFACE_*``, and from a TOML file (``VEILFACE_CONFIG``, or ``veilface.toml`` in the
-working directory). ``docs/settings.md`` is written from these declarations, and a test keeps it
-so.
+working directory). A test keeps ``docs/settings.md`` as these declarations are.
 """
 
 import ipaddress
@@ -43,13 +42,7 @@ _ORIGIN = re.compile(
 
 
 def config_file() -> Path | None:
-    """Path of the TOML file in force, or None.
-
-    Raises
-    ------
-    StartError
-        If ``VEILFACE_CONFIG`` names a file that does not exist.
-    """
+    """Path of the TOML file in force, or None."""
     named = os.environ.get(CONFIG_VARIABLE)
     if named:
         path = Path(named)
@@ -409,14 +402,7 @@ def processors() -> int:
 
 
 def load_settings(**flags: Any) -> Settings:
-    """Read the settings; ``flags`` that are None are taken as not given.
-
-    Raises
-    ------
-    StartError
-        One sentence that names the setting, and what is wrong with it. It never repeats the
-        value: a database URL holds a password.
-    """
+    """Read the settings; ``flags`` that are None are taken as not given."""
     given = {name: value for name, value in flags.items() if value is not None}
     try:
         return Settings(**given)
@@ -428,20 +414,3 @@ def load_settings(**flags: Any) -> Settings:
         if first["type"] == "extra_forbidden":
             raise StartError(f"unknown setting {name}; docs/settings.md lists them") from None
         raise StartError(f"setting {name}: {first['msg'].removeprefix('Value error, ')}") from None
-
-
-def settings_table() -> str:
-    """Write the table of ``docs/settings.md`` from the declarations above."""
-    rows = ["| setting | default | meaning |", "|---|---|---|"]
-    for name, field in Settings.model_fields.items():
-        default = field.default
-        if isinstance(default, tuple):
-            shown = f"`{','.join(default)}`"
-        elif default is None:
-            shown = ""
-        elif isinstance(default, bool):
-            shown = f"`{str(default).lower()}`"
-        else:
-            shown = f"`{default}`"
-        rows.append(f"| `{name}` | {shown} | {field.description} |")
-    return "\n".join(rows) + "\n"

@@ -111,11 +111,6 @@ def test_packages_import_neither_tests_nor_the_layer_of_http(package: str) -> No
             assert not rest & {"fastapi", "starlette", "typer", "uvicorn"}, path
 
 
-def test_every_package_has_its_layer() -> None:
-    packages = {path.parent.name for path in ROOT.glob("*/__init__.py")} - {"tests", "benchmarks"}
-    assert packages == set(LAYERS)
-
-
 def test_the_layers_are_those_of_the_page() -> None:
     text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| (\d) \| (.+?) \|", text, flags=re.MULTILINE)

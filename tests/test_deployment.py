@@ -62,30 +62,6 @@ def test_every_secret_is_a_file_that_a_service_uses() -> None:
     assert not re.search(r"PASSWORD:|PASSWORD=|://[^/\s]*:[^/\s@]*@", text)
 
 
-def test_every_image_from_elsewhere_can_be_pinned_as_the_page_says() -> None:
-    services = COMPOSE["services"]
-    named = [
-        services["veilface"]["build"]["args"]["BASE"],
-        *(service["image"] for name, service in services.items() if name != "veilface"),
-    ]
-    parsed = [re.fullmatch(r"\$\{(\w+):-(.+)\}", image) for image in named]
-    images = {match[1]: match[2] for match in parsed if match is not None}
-    assert len(images) == len(named)
-    assert set(images) == IMAGES
-    assert f"ARG BASE={images['VEILFACE_BASE_IMAGE']}\n" in DOCKERFILE
-    assert re.findall(r"^FROM (\S+)", DOCKERFILE, re.M) == ["${BUILD_BASE}", "${BASE}"]
-    assert "ARG BUILD_BASE=${BASE}\n" in DOCKERFILE
-    page = (ROOT / "docs" / "deploy.md").read_text(encoding="utf-8")
-    for variable, image in images.items():
-        assert f"{variable}=$(pinned {image})" in page
-
-
-def test_what_the_unit_refuses_does_not_kill() -> None:
-    # The matrix library calls mbind, which is refused, while it is imported.
-    assert re.search(r"^SystemCallFilter=~.*@resources", UNIT, re.M)
-    assert re.search(r"^SystemCallErrorNumber=EPERM$", UNIT, re.M)
-
-
 def test_services_that_are_waited_for_have_a_health_check() -> None:
     services = COMPOSE["services"]
     for name, condition in services["veilface"]["depends_on"].items():

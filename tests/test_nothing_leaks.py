@@ -17,7 +17,6 @@ import numpy as np
 import psycopg
 import pytest
 
-from tests.api.cli.conftest import run
 from tests.databases import empty_database
 from tests.leak_material import Material, make_material
 from tests.leak_places import copied_tables, files_of, relation_files
@@ -414,31 +413,3 @@ def test_compacting_takes_what_is_left_out_of_the_files_of_postgresql(
     assert not [piece for piece in wanted if piece in after]
     other = next(subject for subject in traces.subjects if subject != victim.subject_id)
     assert other.encode() in after
-
-
-def test_the_log_names_the_erased_person_by_the_pseudonym(traces: ServiceTraces) -> None:
-    lines = [json.loads(line) for line in traces.erased["err"].splitlines() if line[:1] == b"{"]
-    erasures = [line for line in lines if line.get("method") == "DELETE"]
-    assert [line["subject"] for line in erasures] == [traces.victim.pseudonym[:16]]
-    assert traces.victim.subject_id.encode() not in traces.erased["err"]
-
-
-def test_the_receipt_verifies_and_an_altered_one_does_not(
-    traces: ServiceTraces, tmp_path: Path
-) -> None:
-    contract = tmp_path / "contract.json"
-    contract.write_text(json.dumps(traces.contract_answer))
-    receipt = tmp_path / "receipt.json"
-    receipt.write_text(json.dumps(traces.receipt_answer))
-    ran = run("keys", "verify-receipt", receipt, "--public-key", contract, "--json")
-    assert ran.status == 0
-    claims = ran.json["claims"]
-    assert claims["subject"] == traces.victim.pseudonym
-    assert claims["held"] is True
-    erased = {entry["item"]: entry["count"] for entry in claims["erased"]}
-    assert (erased["template"], erased["data_key"]) == (1, 1)
-
-    altered = json.loads(receipt.read_text())
-    altered["receipt"]["body"] = altered["receipt"]["body"].replace('"held":true', '"held":false')
-    receipt.write_text(json.dumps(altered))
-    assert run("keys", "verify-receipt", receipt, "--public-key", contract).status == 1

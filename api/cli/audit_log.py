@@ -20,8 +20,8 @@ from api.service.opening import checked_store
 from api.settings import DEFAULT_TENANT, Settings
 from templates.store import TemplateStore
 from templates.store.audit_archive import Archive, verify_archive
-from templates.store.audit_chain import Anchor, BrokenAuditLog
-from templates.store.audit_log import AuditLog, Line
+from templates.store.audit_chain import Anchor
+from templates.store.audit_log import Line
 from templates.store.identifiers import InvalidIdentifier
 
 PROBLEMS_SHOWN = 20
@@ -60,7 +60,7 @@ def verify(
     kept = None if anchor is None else _read_anchor(anchor)
     with (
         checked_store(settings) as store,
-        progress("verifying the audit log", _length(store.audit_log)) as advance,
+        progress("verifying the audit log", None) as advance,
     ):
         report, records = store.verify_audit_log(anchor=kept, progress=advance)
     problem, intact = report.problem, report.intact and not records
@@ -180,12 +180,7 @@ def show(
 
 
 def _lines_of(store: TemplateStore, tenant: str, lines: Iterable[Line]) -> Iterator[Line]:
-    """Return the lines of a tenant, which may be erased; refuse one that has neither line nor row.
-
-    Raises
-    ------
-    UnknownTenant
-    """
+    """Return the lines of a tenant, which may be erased; refuse one that never was."""
     there = False
     for line in lines:
         if line.tenant == tenant:
@@ -207,14 +202,6 @@ def _described(line: Line) -> dict[str, Any]:
         "detail": line.detail,
         "request_id": line.request_id,
     }
-
-
-def _length(log: AuditLog) -> int | None:
-    """Lines to read, for the progress bar; None where the head, which says so, is broken."""
-    try:
-        return log.head().sequence
-    except BrokenAuditLog:
-        return None
 
 
 def _read_anchor(text: str) -> Anchor:

@@ -15,10 +15,8 @@ from typing import Annotated
 import numpy as np
 import typer
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from api.cli.console import progress
-from api.cli.errors import UsageError
 from api.cli.inputs import listed_dims, listed_names, listed_numbers
 from api.cli.options import PROCESSOR, Device, chosen_device
 from api.cli.results import Result, Table, reports
@@ -54,12 +52,7 @@ def distances(
     repeats: Annotated[
         int, typer.Option(min=1, help="Timed repeats; medians of them are shown.")
     ] = 5,
-    threads: Annotated[
-        int | None,
-        typer.Option(min=1, help="Threads of distances and products. Unset: the library's."),
-    ] = None,
     device: Device = PROCESSOR,
-    seed: Annotated[int, typer.Option(min=0, help="Seed for the random choices.")] = 0,
 ) -> Result:
     """Time all distances between probes and templates, beside the bare matrix product.
 
@@ -79,23 +72,20 @@ def distances(
         for name in listed_names(metric, tuple(Metric), "--metric")
     ]
     on = chosen_device(device)
-    if on is not None and threads is not None:
-        raise UsageError("--threads counts the processor's threads: leave it out with --device")
     if on is None:
         warm_up()
     rows = []
     with (
         progress("measuring", len(cells)) as advance,
-        threadpool_limits(limits=threads, user_api="blas"),
         on_device(on),
     ):
         for size, m, kind, each in cells:
-            stream = Keystream.seeded("distance bench", seed, size, m)
+            stream = Keystream.seeded("distance bench", size, m)
             templates = face_like_templates(count, m, size, stream=stream)
             probes: Probes = face_like(count, size, stream=stream)
             if kind == "s2s":
                 probes = face_like_templates(count, m, size, stream=stream)
-            times = time_in_turn(probes, templates, each, repeats=repeats, threads=threads)
+            times = time_in_turn(probes, templates, each, repeats=repeats)
             rows.append({"n": size, "m": m, "mode": kind, "metric": str(each), **times})
             advance(1)
     shown = [
@@ -109,9 +99,9 @@ def distances(
         )
         for row in rows
     ]
-    machine = {"processors": processors(), "threads": threads, "device": device}
+    machine = {"processors": processors(), "device": device}
     return Result(
-        {"machine": machine, "count": count, "repeats": repeats, "seed": seed, "rows": rows},
+        {"machine": machine, "count": count, "repeats": repeats, "rows": rows},
         [
             Table(f"{count} × {count} distances in float32", COLUMNS, shown),
             f"Of {repeats} repeats: median times, and medians of their ratios (smallest to largest "
@@ -126,7 +116,6 @@ def time_in_turn(
     metric: Metric,
     *,
     repeats: int,
-    threads: int | None,
 ) -> dict[str, float]:
     """Time product, distances and the authors' formula in turn; medians, and ratios in a repeat."""
     left, right = _stacked(probes), _stacked(templates)
@@ -137,9 +126,7 @@ def time_in_turn(
     for row in times:
         row[0] = _milliseconds(lambda: np.matmul(left, right.T, out=table))
         time.sleep(REST_S)
-        row[1] = _milliseconds(
-            lambda: pairwise_distances(probes, templates, metric=metric, threads=threads)
-        )
+        row[1] = _milliseconds(lambda: pairwise_distances(probes, templates, metric=metric))
         row[2] = _milliseconds(lambda: authors_distances(probes[some], templates[some])) * share
     whole, ours, authors = times[1:].T  # the first round only fetches code and memory
     return {

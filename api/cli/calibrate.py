@@ -12,8 +12,8 @@ from api.cli.console import counted, demo_notice, share_done
 from api.cli.descriptors import BULK, Aligned, Cache, Flip, bulk_pack, each_person_once, extract
 from api.cli.errors import UsageError
 from api.cli.files import read_names
-from api.cli.groups import estimated_labels, group_tables, labels_of
-from api.cli.inputs import fairface_labels, listed_numbers, load_decoys
+from api.cli.groups import group_tables, labels_of
+from api.cli.inputs import listed_numbers, load_decoys
 from api.cli.photo_folders import people_or_faces
 from api.cli.results import Plan, Result, Table, reports
 from api.cli.verdict import improvements, shown_rate, verdict_lines
@@ -109,13 +109,6 @@ def calibrate(
             "error rates by group."
         ),
     ] = None,
-    fairface: Annotated[
-        Path | None,
-        typer.Option(
-            help="Instead of --labels, the folder of FairFace: gender, race and age are estimated "
-            "from its nearest training faces."
-        ),
-    ] = None,
     worst_group: Annotated[
         bool,
         typer.Option(
@@ -163,12 +156,9 @@ def calibrate(
         raise UsageError(f"--dim must be below the {pack.info.n} numbers of an embedding")
     if axes is not None and not (dim or 1) < axes <= pack.info.n:
         raise UsageError(f"--axes must lie above --dim, and be at most {pack.info.n}")
-    if labels is not None and fairface is not None:
-        raise UsageError("give --labels or --fairface, not both: labels are better than estimates")
-    if worst_group and labels is None and fairface is None:
-        raise UsageError("--worst-group needs to know the groups: give --labels or --fairface")
+    if worst_group and labels is None:
+        raise UsageError("--worst-group needs to know the groups: give --labels")
     known = None if labels is None else read_labels(labels)
-    faces = None if fairface is None else fairface_labels(fairface, "train")
     labelled = people_or_faces(folder)
     keyring = open_keyring(settings)
     sealer = file_sealer(keyring)
@@ -178,10 +168,6 @@ def calibrate(
     if labelled.people == len(labelled):
         extraction = each_person_once(extraction)
     groups = None if known is None else labels_of(extraction, known, labelled.root)
-    if faces is not None:
-        # FairFace's own photos are no aligned crops, whatever those of the people are.
-        like = extract(pack, list(faces), aligned=False, settings=settings, cache=cache)
-        groups = estimated_labels(extraction, like, faces)
     with share_done("calibrating") as report:
         done = calibrate_folder(
             labelled,

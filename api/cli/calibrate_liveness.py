@@ -21,15 +21,7 @@ from verify.evaluation.liveness.rates import calibrate_liveness
 
 
 def set_liveness_threshold(data: Path, file: Path, settings: Settings, *, bpcer: float) -> Result:
-    """Set the threshold at a BPCER on live photos, and store it in a contract file.
-
-    Raises
-    ------
-    CommandError
-        There is no contract yet, or the pack has no liveness graph.
-    DatasetError
-        The photos are too few for the rate.
-    """
+    """Set the threshold at a BPCER on live photos, and store it in a contract file."""
     if not 0 < bpcer < 1:
         raise UsageError("--bpcer takes a rate between 0 and 1")
     presented = read_presentations(data, attacks=False)

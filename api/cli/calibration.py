@@ -66,28 +66,11 @@ def calibrate_folder(
     labels: PhotoLabels | None = None,
     progress: Progress = lambda _what, _share: None,
 ) -> CalibratedFolder:
-    """Calibrate on the descriptors of a labelled folder; judge privacy, accuracy and groups.
+    """Calibrate on the embeddings of a labelled folder; judge privacy, accuracy and groups.
 
-    LFW's own pairs are used for the ten-fold protocol where ``pairs.txt`` lies in the folder.
-
-    Parameters
-    ----------
-    source
-        With all of its axes.
-    axes, m
-        Axes that embeddings are projected on, and dimension of the templates; None: what rejects
-        the fewest genuine probes of all that is private.
-    labels
-        Of the photos of ``extraction``, for rates by group of people.
-    progress
-        Called with what is being done and the share of the whole, which rises from 0 to 1.
-
-    Raises
-    ------
-    ContractError
-        The decoys were made of these people, or the data are too few for a single level.
-    PreparationError
-        The strategy has no decoys.
+    ``source`` has all of its axes. ``axes`` and ``m`` that are None are chosen: what rejects the
+    fewest genuine probes of all that is private. LFW's own pairs are used for the ten-fold protocol
+    where ``pairs.txt`` lies in the folder.
     """
     if not strategy.needs_decoys:
         raise PreparationError(

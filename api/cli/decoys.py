@@ -6,7 +6,6 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 
 from api.cli.console import demo_notice, message
@@ -78,13 +77,6 @@ def build(
             "or a folder whose subfolders are named like the people."
         ),
     ] = None,
-    limit: Annotated[
-        int | None,
-        typer.Option(
-            min=1, help="Take this many photos of SOURCE, chosen at random.", show_default=False
-        ),
-    ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed for the random choices.")] = 0,
     aligned: Aligned = False,
     flip: Flip = False,
     cache: Cache = None,
@@ -107,9 +99,6 @@ def build(
     if not chosen or (like and not sample):
         folders = ", ".join(map(str, photos if not chosen else like or []))
         raise CommandError(f"{exclude} leaves no photo of {folders}")
-    if limit is not None and limit < len(chosen):
-        picked = np.random.default_rng(seed).choice(len(chosen), limit, replace=False)
-        chosen = [chosen[index] for index in sorted(picked.tolist())]
     attributes = _labels(photos, labels)
     embed = partial(extract, pack, aligned=aligned, settings=settings, cache=cache)
     extraction = embed(chosen)

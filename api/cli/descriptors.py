@@ -38,13 +38,7 @@ Cache = Annotated[
 
 
 def bulk_pack(settings: Settings, *, flip: bool, why: str) -> ModelPack:
-    """Load the pack with as many threads as there are processors.
-
-    Raises
-    ------
-    UsageError
-        No pack is named; ``why`` says what it is needed for.
-    """
+    """Load the pack with as many threads as there are processors."""
     if settings.pack is None:
         raise UsageError(f"{why}; name the pack with --pack")
     return ModelPack.load(
@@ -68,13 +62,7 @@ def extract(
     settings: Settings,
     cache: Path | None,
 ) -> Extraction:
-    """Embed photos; those that fail are counted, reported and left out.
-
-    Raises
-    ------
-    CommandError
-        No photo gave an embedding.
-    """
+    """Embed photos; those that fail are counted, reported and left out."""
     kept = open_cache(cache, settings)
     extractor = Extractor(pack, aligned=aligned, cache=kept)
     with progress("embedding faces", len(photos)) as advance:

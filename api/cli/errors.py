@@ -60,13 +60,7 @@ class Commands(TyperGroup):
 
 
 def require_extra(extra: str) -> None:
-    """Refuse at once what would otherwise fail after hours.
-
-    Raises
-    ------
-    CommandError
-        A package of the extra is missing.
-    """
+    """Refuse at once what would otherwise fail after hours."""
     for package in EXTRAS[extra]:
         if find_spec(package) is None:
             raise CommandError(_missing(package, extra))

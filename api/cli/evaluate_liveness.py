@@ -129,13 +129,7 @@ def evaluate_liveness(
 
 
 def require_liveness(pack: ModelPack) -> PassiveLiveness:
-    """Return the liveness graphs of a pack.
-
-    Raises
-    ------
-    CommandError
-        It has none.
-    """
+    """Return the liveness graphs of a pack."""
     if pack.liveness is None:
         raise CommandError(
             f"the pack {pack.info.name} has no liveness graph: add one to its folder "
@@ -154,13 +148,7 @@ def score_with_progress(pack: ModelPack, presented: PresentationSet) -> ScoredSe
 
 
 def require_responses(scored: ScoredSet) -> None:
-    """Refuse a set of which a whole side has no face.
-
-    Raises
-    ------
-    CommandError
-        No live photo, or no attack photo, gave a score.
-    """
+    """Refuse a set of which a whole side has no face."""
     attacks = [len(scored.scored(name)) for name in scored.presented.species]
     if not len(scored.scored(None)) or not any(attacks):
         raise CommandError(

@@ -24,13 +24,7 @@ NO_PACK = "none"
 
 
 def open_all(datasets: Sequence[Path], *, pictures: bool) -> list[VerificationSet]:
-    """Open the sets, and say what is unusual in them.
-
-    Raises
-    ------
-    UsageError
-        Two have one name.
-    """
+    """Open the sets, and say what is unusual in them."""
     sets = [pairs for path in datasets for pairs in open_sets(path, pictures=pictures)]
     names = [pairs.name for pairs in sets]
     if len(set(names)) < len(names):
@@ -47,13 +41,7 @@ def open_all(datasets: Sequence[Path], *, pictures: bool) -> list[VerificationSe
 def wants_raw_flip(
     strategies: tuple[str, ...] | None, embeddings: Path | None, *, flip: bool
 ) -> bool:
-    """Whether raw embeddings with the mirror image are compared beside the others.
-
-    Raises
-    ------
-    UsageError
-        They are asked for, and there is nothing to compute them with or to compare them with.
-    """
+    """Whether raw embeddings with the mirror image are compared beside the others."""
     if strategies is None:
         return embeddings is None and not flip
     if RAW_FLIP in strategies and (embeddings is not None or flip):
@@ -72,20 +60,7 @@ def open_embedder(
     raw_flip: bool,
     aligned: bool | None,
 ) -> Embedder:
-    """Open the pack or the file of embeddings.
-
-    Parameters
-    ----------
-    raw_flip
-        Compare raw embeddings with the mirror image too.
-    aligned
-        Whether the photos are aligned crops; None to see.
-
-    Raises
-    ------
-    UsageError
-        Both are named, or neither.
-    """
+    """Open the pack or the file of embeddings."""
     no_pack = settings.pack is None or str(settings.pack) == NO_PACK
     if embeddings is None:
         why = "embeddings come from a model pack; without one, give --pack none --embeddings FILE"
@@ -108,15 +83,7 @@ def open_embedder(
 def open_sources(
     files: Sequence[Path], settings: Settings, embedder: Embedder, *, axes: int | None = None
 ) -> list[SourceFacts]:
-    """Load decoy files, reduce generators to so many axes, and check that they fit.
-
-    Raises
-    ------
-    CommandError, UsageError
-        They have another dimension, or are of one kind twice.
-    ContractMismatch
-        They were made with another model.
-    """
+    """Load decoy files, reduce generators to so many axes, and check that they fit."""
     sources = []
     for file in files:
         with file.open("rb") as stream:

@@ -19,13 +19,7 @@ def read_bounded(path: Path, most: int) -> bytes:
 
 
 def read_photo(path: Path) -> bytes:
-    """Read a photo that somebody named.
-
-    Raises
-    ------
-    UsageError
-        There is none.
-    """
+    """Read a photo that somebody named."""
     try:
         return read_bounded(path, DEFAULT_LIMITS.max_bytes)
     except FileNotFoundError:

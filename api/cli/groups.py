@@ -1,6 +1,5 @@
 """Groups of people in a calibration: where their labels come from, and how rates are shown."""
 
-from collections.abc import Mapping
 from pathlib import Path
 
 from api.cli.results import Table
@@ -9,9 +8,7 @@ from attacks.operating_point import ADVISED_PHOTOS
 from models.extraction import Extraction
 from templates.contract.document import Contract, Level, Rate
 from templates.contract.levels import photos_in_words
-from verify.evaluation.attributes import NEIGHBOURS, voted
 from verify.evaluation.labels_file import Labels
-from verify.fairface_labels import CLASSES, Label
 from verify.group_rates import PhotoLabels
 
 
@@ -21,23 +18,6 @@ def labels_of(photos: Extraction, labels: Labels, root: Path) -> PhotoLabels:
     return PhotoLabels(
         {attribute: labels.column(attribute, names) for attribute in labels.attributes},
         "a label file",
-    )
-
-
-def estimated_labels(
-    photos: Extraction, faces: Extraction, labels: Mapping[Path, Label]
-) -> PhotoLabels:
-    """Estimate the labels of photos by their nearest neighbours among labelled faces."""
-    return PhotoLabels(
-        {
-            attribute: voted(
-                photos.embeddings,
-                faces.embeddings,
-                [str(getattr(labels[path], attribute)) for path in faces.paths],
-            )
-            for attribute in CLASSES
-        },
-        f"the vote of the {NEIGHBOURS} nearest of {len(faces.paths)} faces of FairFace",
     )
 
 

@@ -62,18 +62,7 @@ def quick(**smaller: Any) -> Any:
 
 
 def chosen_device(device: str, *, here: bool = True) -> str | None:
-    """Check the device of a flag; None for the processor, which needs no torch.
-
-    Parameters
-    ----------
-    here
-        Whether this machine is to have it.
-
-    Raises
-    ------
-    UsageError
-        There is no torch, or no such device.
-    """
+    """Check that this machine, unless not ``here``, has a device; None for the processor."""
     if device == PROCESSOR:
         return None
     if not here:

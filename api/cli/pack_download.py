@@ -33,26 +33,8 @@ def shown(source: str) -> str:
 def obtained(source: str, into: Path, *, sha256: str | None) -> tuple[str, int]:
     """Put the graphs of one source, an archive or a graph, into a folder.
 
-    Parameters
-    ----------
-    source
-        Address, or path of a file of this machine.
-    sha256
-        What the bytes must hash to, in hex; None for anything.
-
-    Returns
-    -------
-    sha256 : str
-        Of the bytes.
-    left_out : int
-        Entries of the archive that are no graphs.
-
-    Raises
-    ------
-    CommandError
-        The source cannot be reached or read, is too large, or has another hash.
-    PackError
-        The archive is not to be trusted.
+    Returned are the SHA-256 of its bytes, in hex, which must be ``sha256`` if that is given, and
+    the number of entries of the archive that are no graphs.
     """
     with tempfile.NamedTemporaryFile(prefix=".draft-", dir=into) as draft:
         if _is_address(source):

@@ -18,11 +18,6 @@ def find_photos(folder: Path) -> list[Path]:
     """All photos below a folder, in the order of their paths; copies of a file count once.
 
     What else lies there is named to the person.
-
-    Raises
-    ------
-    CommandError
-        It is no folder, or has no photo.
     """
     if not folder.is_dir():
         raise CommandError(f"{folder} is not a folder")
@@ -41,11 +36,6 @@ def labelled_people(folder: Path) -> LabelledFolder:
     """Read ``folder/Person/photo.jpg``; copies of one person's photo count once.
 
     What is left out is named to the person.
-
-    Raises
-    ------
-    DatasetError
-        As of `verify.labelled_folder`.
     """
     labelled = labelled_folder(folder)
     albums: dict[str, list[Path]] = {}
@@ -62,13 +52,6 @@ def albums_of(folder: Path) -> tuple[dict[str, list[Path]], dict[str, str]]:
     """Photos by subject id, of ``folder/Person/photo.jpg``; and why others cannot be enrolled.
 
     Names that are spellings of one id are one person.
-
-    Raises
-    ------
-    UsageError
-        It is no folder.
-    DatasetError
-        As of `verify.labelled_folder`.
     """
     # Imported here: most commands that read folders open no store, which takes seconds to load.
     from templates.store.identifiers import InvalidIdentifier, checked_subject_id

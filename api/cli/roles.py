@@ -41,16 +41,9 @@ T = TypeVar("T")
 class Roles:
     """Photos by role; the name of a person is in one of the three.
 
-    Parameters
-    ----------
-    faces
-        Photos of anybody, that decoys are fitted to.
-    sample
-        Photos of the kind that will be enrolled, that decoys are adapted to; may be empty.
-    calibration
-        Photos by person, that thresholds and the verdict are measured on.
-    left_out
-        Photos of the other roles that are named like people of the calibration or the sample.
+    Decoys are fitted to ``faces`` and adapted to ``sample``, which is of the kind that will be
+    enrolled, and may be empty. Thresholds and verdict are measured on ``calibration``. ``left_out``
+    counts photos of people who have another role.
     """
 
     faces: tuple[Path, ...] = field(repr=False)
@@ -67,13 +60,7 @@ class Roles:
 def assign_roles(
     labelled: LabelledFolder, faces: Sequence[Path], like: Sequence[Path] = ()
 ) -> Roles:
-    """Give every photo one role, where people are labelled.
-
-    Raises
-    ------
-    CommandError
-        No face is left to fit decoys to, or no photo of ``like``.
-    """
+    """Give every photo one role, where people are labelled."""
     albums: dict[str, list[Path]] = {}
     for path, name in zip(labelled.paths, labelled.identities, strict=True):
         albums.setdefault(name, []).append(path)
@@ -97,11 +84,6 @@ def assign_faces(faces: Sequence[Path], apart: LabelledFolder | None) -> Roles:
     """Give every photo one role, where each is taken for a person of its own.
 
     Nobody of ``apart`` is taken.
-
-    Raises
-    ------
-    CommandError
-        They are too few to set thresholds by, and to fit decoys to.
     """
     names = frozenset() if apart is None else frozenset(apart.identities)
     photos, left_out = _others(faces, names, () if apart is None else apart.paths)

@@ -304,13 +304,7 @@ def kept_api_key(settings: Settings, keyring: MasterKeyring) -> Path:
 
 
 def _write_settings(settings: Settings) -> str | None:
-    """Write the settings file, or keep the one that is there.
-
-    Returns
-    -------
-    str or None
-        What is wrong where that file would have another service started.
-    """
+    """Write the settings file, or keep one that is there; say what is wrong with that, or None."""
     names = ["data_dir", "pack"]
     names += ["master_key_file"] if settings.master_key_file is not None else []
     if settings.database_url is not None:

@@ -59,8 +59,8 @@ _CHILDREN = "Of children below about ten years no level holds that was set on ad
 def _groups_line(groups: Judgement | None) -> str:
     if groups is None:
         return (
-            "Groups:   not measured: nobody is labelled (`veilface calibrate` takes --labels or "
-            "--fairface), or too few in every group."
+            "Groups:   not measured: nobody is labelled (`veilface calibrate` takes --labels), or "
+            "too few in every group."
         )
     basis = groups.basis
     photos = photos_in_words(cast("int", basis["probe_photos"]))
@@ -76,11 +76,7 @@ def plain_lines(verdict: Verdict | None, *, strangers: bool = False) -> tuple[st
     """Say to somebody who knows no biometrics how private and how accurate a contract is.
 
     Every figure is the verdict's own, except for what was measured elsewhere, which is named so.
-
-    Parameters
-    ----------
-    strangers
-        Whether it was judged on faces that may not look like those who will be enrolled.
+    ``strangers``: it was judged on faces that may not look like those who will be enrolled.
     """
     if verdict is None:
         return (

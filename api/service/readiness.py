@@ -25,13 +25,6 @@ class Readiness:
 
     A database may answer and yet take no write, and a model may be there and yet fail. So after a
     failure the thing that failed must succeed once before the worker is ready again.
-
-    Parameters
-    ----------
-    store, pack, gate
-        What is asked, and what bounds the asking; no pack is nothing to ask.
-    keyring
-        The master keys, whose file may change, and then be one that cannot be read.
     """
 
     def __init__(

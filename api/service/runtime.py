@@ -208,11 +208,6 @@ class Runtime(Deployment):
 
         It stays turned by the holder's, whose key is not here. Its line stands in the audit log
         before it is returned.
-
-        Raises
-        ------
-        ContractMismatch
-            If the stored template belongs to another contract: its dimension may not even fit.
         """
         read = self.read(tenant, subject)
         if read is None:

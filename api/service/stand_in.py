@@ -13,17 +13,7 @@ from verify import StandIn
 
 
 class SealedStandIn:
-    """A template of nobody, sealed as the store seals real ones, so that opening it costs the same.
-
-    Parameters
-    ----------
-    nobody
-        What it is lifted from, once.
-    keyring
-        What seals it.
-    contract_id
-        Of the contract in force.
-    """
+    """A template of nobody, sealed as real ones are, so that opening it costs the same."""
 
     def __init__(self, nobody: Nobody, keyring: MasterKeyring, *, contract_id: str) -> None:
         stream = Keystream(secrets.token_bytes(32))

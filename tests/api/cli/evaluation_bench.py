@@ -134,26 +134,6 @@ def embedded(bench: Bench, *, flip: bool = False) -> dict[Path, np.ndarray]:
     )
 
 
-def numbers(rows: list[Any]) -> list[Any]:
-    """Rows without the name of their set and without what depends on the names of people."""
-    kept = []
-    for row in rows:
-        own = {key: value for key, value in row.items() if key not in ("dataset", "interval")}
-        for part in ("low", "high"):
-            own.pop(part, None)
-        if "fnmr_at_fmr" in own:
-            own["fnmr_at_fmr"] = {
-                target: {
-                    key: value
-                    for key, value in at.items()
-                    if key not in ("ci_low", "ci_high", "interval")
-                }
-                for target, at in own["fnmr_at_fmr"].items()
-            }
-        kept.append(own)
-    return kept
-
-
 def secret_bytes(rows: Any) -> list[bytes]:
     """How a row may stand in a file: three widths of floats, or as text."""
     found = []

@@ -144,9 +144,3 @@ def test_what_is_no_anchor_is_refused(log):
     ran = log("audit-log", "verify", "--anchor", "yesterday")
     assert ran.status == 2
     assert "audit-log head" in ran.stderr
-
-
-def test_an_absent_database_is_not_made(tmp_path):
-    ran = run("audit-log", "verify", "--data-dir", tmp_path / "new")
-    assert ran.status == 1
-    assert "veilface db upgrade" in ran.stderr

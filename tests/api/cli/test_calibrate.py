@@ -71,22 +71,6 @@ def test_people_are_left_out_and_ten_fold_adds_a_level(world, veilface, data, tm
     assert contract.calibration("p2s").level("accuracy").target_fmr is None
 
 
-def test_decoys_of_another_space_are_refused(world, veilface, data, tmp_path):
-    """As many numbers, but another preprocessing, another model, or nobody knows which."""
-    base = ("calibrate", world.labelled, "--pack", world.pack, "--out", tmp_path / "contract.json")
-    ran = veilface(*base, "--flip")
-    assert ran.status == 1
-    assert "build the decoys with this pack and the same --flip" in " ".join(ran.stderr.split())
-    decoys = DecoyGenerator.load(data / "decoys.veil")
-    parts = decoys.axes, decoys.mean, decoys.root
-    for made_with, said in (("5a" * 32, "another model"), (None, "do not say which model")):
-        DecoyGenerator(*parts, made_with=made_with).save(tmp_path / "decoys.veil")
-        ran = veilface(*base, "--decoys", tmp_path / "decoys.veil")
-        assert ran.status == 1
-        assert said in " ".join(ran.stderr.split())
-    assert not (tmp_path / "contract.json").exists()
-
-
 @pytest.mark.parametrize("kind", ["generator", "pool"])
 def test_decoys_of_the_people_themselves_are_refused(world, veilface, tmp_path, kind):
     own = tmp_path / "own.veil"
@@ -211,46 +195,6 @@ def test_labels_give_rates_by_group_and_thresholds_that_hold_in_each(
     last = ran.stdout.splitlines()[-1]
     assert last.startswith("Groups:   PASS. Worst is kind ")
     assert last.endswith("no level holds that was set on adults.")
-
-
-def test_groups_are_estimated_by_the_nearest_faces_of_fairface(world, veilface, tmp_path):
-    root = tmp_path / "fairface"
-    (root / "train").mkdir(parents=True)
-    lines = ["file,age,gender,race,service_test"]
-    for i, photo in enumerate(sorted(world.decoy_faces.rglob("*.png"))[:40]):
-        (root / "train" / f"{i}.png").write_bytes(photo.read_bytes())
-        lines.append(f"train/{i}.png,{'20-29' if i % 2 else '3-9'},Female,Indian,True")
-    (root / "fairface_label_train.csv").write_text("\n".join(lines) + "\n")
-    ran = veilface(
-        *("calibrate", world.labelled, "--pack", world.pack, "--axes", "32", "--dim", "8"),
-        *("--probe-dims", "none"),
-        *("--fairface", root, "--out", tmp_path / "contract.json", "--json"),
-    )
-    assert ran.status == 0, ran.stderr
-    (calibration,) = ran.json["contract"]["calibrations"]
-    assert calibration["calibrated_on"]["groups_from"] == (
-        "the vote of the 10 nearest of 40 faces of FairFace"
-    )
-    groups = calibration["levels"][0]["groups"]
-    whole = [entry for entry in groups if entry["attribute"] in ("gender", "race")]
-    assert {entry["group"] for entry in whole} == {"Female", "Indian"}
-    # Everybody is in these, so that they are as all trials are.
-    for entry in whole:
-        assert entry["fmr"]["trials"] == calibration["levels"][0]["fmr"]["trials"]
-        assert entry["fmr"]["errors"] == calibration["levels"][0]["fmr"]["errors"]
-
-
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        (("--worst-group",), "give --labels or --fairface"),
-        (("--labels", "a.csv", "--fairface", "b"), "not both"),
-    ],
-)
-def test_groups_that_nobody_can_tell_are_refused(world, veilface, options, said):
-    ran = veilface("calibrate", world.labelled, "--pack", world.pack, *options)
-    assert ran.status == 2
-    assert said in " ".join(ran.stderr.split())
 
 
 def test_random_lifting_is_for_experiments_only(world, veilface, tmp_path):

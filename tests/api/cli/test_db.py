@@ -75,15 +75,6 @@ def test_compact_gives_the_space_of_erased_subjects_back(tmp_path):
     store.close()
 
 
-def test_another_master_key_fails_the_check(tmp_path):
-    where = ("--data-dir", tmp_path)
-    assert run("db", "upgrade", *where).status == 0
-    MasterKeyring.create(tmp_path / "other.key")
-    ran = run("db", "check", *where, "--master-key-file", tmp_path / "other.key")
-    assert ran.status == 1
-    assert "not the master key of this database" in ran.stderr
-
-
 @pytest.mark.parametrize("command", ["upgrade", "check", "compact"])
 def test_a_database_that_does_not_answer_is_a_sentence(tmp_path, command):
     url = "postgresql+psycopg://someone:s3cret@127.0.0.1:1/none"

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from sklearn.model_selection import KFold
 
 from models.demo import DEMO_NOTICE
 from templates.space.subspace import SubspaceBatch
@@ -25,7 +24,6 @@ from tests.api.cli.evaluation_bench import (
     PAIRS,
     STRATEGIES,
     embedded,
-    numbers,
     pairs_of,
     secret_bytes,
     secrets,
@@ -100,28 +98,6 @@ def test_rows_are_what_was_asked_for(results):
     assert [tuple(row[key] for key in keys) for row in results["rows"]] == expected
 
 
-@pytest.mark.parametrize(("strategy", "flip"), [("raw", False), ("raw+flip", True)])
-def test_raw_rows_are_those_of_the_literature(bench, results, strategy, flip):
-    """InsightFace's ``calculate_accuracy`` written anew, with scikit-learn's folds."""
-    known = embedded(bench, flip=flip)
-    pairs = pairs_of(bench.lfw)
-    same = np.array([one for *_, one in pairs])
-    gaps = np.array([known[a].astype(float) - known[b].astype(float) for a, b, _ in pairs])
-    distances = np.square(gaps).sum(axis=1)
-    accuracies = []
-    for train, test in KFold(n_splits=10, shuffle=False).split(np.arange(len(pairs))):
-        right = [np.mean((distances[train] < t) == same[train]) for t in np.arange(0, 4, 0.01)]
-        threshold = np.arange(0, 4, 0.01)[np.argmax(right)]
-        accuracies.append(np.mean((distances[test] < threshold) == same[test]))
-    (row,) = (
-        row
-        for row in results["rows"]
-        if (row["strategy"], row["threshold_search"]) == (strategy, "grid")
-    )
-    assert row["accuracy_mean"] == pytest.approx(np.mean(accuracies), abs=1e-12)
-    assert row["accuracy_std"] == pytest.approx(np.std(accuracies), abs=1e-12)
-
-
 def test_groups_are_reported(results, bench):
     genuine = [one for one in pairs_of(bench.lfw) if one[2]]
     female = sum(int(a.parent.name.split("_")[1]) % 2 for a, *_ in genuine)
@@ -166,16 +142,6 @@ def test_no_face_is_left_in_what_was_written(bench, tmp_path, monkeypatch):
     assert not [needle for needle in needles if needle in whole]
 
 
-@pytest.mark.long
-def test_a_second_run_on_other_threads_says_the_same(bench, results, tmp_path):
-    again = run(*bench.full, "--jobs", "2", "--out", tmp_path / "out", "--json")
-    assert again.status == 0, again.stderr
-    said = again.json
-    for part in ("notice", "out", "files"):
-        said.pop(part)
-    assert said == results
-
-
 WITHOUT_FLIP = ",".join(name for name in STRATEGIES if name != "raw+flip")
 
 
@@ -205,28 +171,6 @@ def test_descriptors_from_a_file_give_the_rows_of_the_pack(bench, results, tmp_p
                 for target, at in row["fnmr_at_fmr"].items()
             }
         assert theirs == wanted
-
-
-@pytest.mark.long
-def test_a_bin_of_the_same_photos_gives_the_same_numbers(bench, results, tmp_path):
-    photos = [photo.read_bytes() for a, b, _ in pairs_of(bench.lfw) for photo in (a, b)]
-    same = [one for *_, one in pairs_of(bench.lfw)]
-    (tmp_path / "drawn.bin").write_bytes(pickle.dumps((photos, same)))
-    ran = run(
-        *("evaluate", tmp_path / "drawn.bin", *bench.base, *bench.decoys, *bench.plan),
-        # hybrid+ by predicted attributes: photos of a .bin have no names to be labelled by.
-        *("--strategy", ",".join(name for name in STRATEGIES if name != "hybrid+")),
-        *("--out", tmp_path / "out", "--json"),
-    )
-    assert ran.status == 0, ran.stderr
-    (dataset,), (folder,) = ran.json["datasets"], results["datasets"]
-    assert (dataset["kind"], dataset["aligned"], dataset["people"]) == ("bin", True, None)
-    assert dataset["pictures_sha256"] == folder["pictures_sha256"]
-    for part in ("rows", "runs", "curves"):
-        wanted = [row for row in results[part] if row["strategy"] != "hybrid+"]
-        assert numbers(ran.json[part]) == numbers(wanted)
-        assert {row["dataset"] for row in ran.json[part]} == {"drawn"}
-    assert {row["fnmr_at_fmr"]["0.2"]["interval"] for row in ran.json["rows"]} == {"pair-bootstrap"}
 
 
 class Hostile:

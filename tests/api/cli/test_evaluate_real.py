@@ -130,15 +130,6 @@ def test_raw_numbers_are_those_of_the_literature(
     assert row["accuracy_mean"] > 0.98
 
 
-def test_crops_are_recognised_as_aligned(part: Part) -> None:
-    (dataset,) = part.ran.json["datasets"]
-    assert dataset["aligned"] is True
-    assert dataset["failures"] == []
-    assert "notice" not in part.ran.json
-    assert "demo" not in part.ran.stderr
-    assert all(row["n_genuine"] == FOLDS * PER_CLASS for row in part.ran.json["rows"])
-
-
 def test_lifted_rows_have_the_order_of_the_paper(part: Part) -> None:
     """More decoys cost accuracy, most where both are."""
     auc = {

@@ -1,7 +1,4 @@
-import pytest
-
-from api.cli.errors import CommandError
-from api.cli.files import is_left_out, read_bounded, read_names
+from api.cli.files import is_left_out, read_names
 
 
 def test_names_come_from_a_folder_or_a_file(tmp_path):
@@ -19,11 +16,3 @@ def test_a_person_or_a_photo_is_left_out(tmp_path):
     assert is_left_out(photo, tmp_path, frozenset({"Bob"}))
     assert is_left_out(photo, tmp_path, frozenset({"Bob/1.jpg"}))
     assert not is_left_out(photo, tmp_path, frozenset({"Bo", "1.jpg"}))
-
-
-def test_a_large_file_is_refused(tmp_path):
-    path = tmp_path / "template"
-    path.write_bytes(b"123456")
-    assert read_bounded(path, 6) == b"123456"
-    with pytest.raises(CommandError, match="more than 5 bytes"):
-        read_bounded(path, 5)

@@ -124,13 +124,6 @@ def test_rotation_wraps_everything_again_and_retires_the_old_key(world, veilface
     assert again.json["rewrapped"] == 0
 
 
-def test_a_rotation_without_retiring_keeps_both_keys(veilface, data):
-    ran = veilface("keys", "rotate")
-    assert ran.status == 0, ran.stderr
-    assert "--retire" in ran.stdout
-    assert len(key_file(data).read_text().split()) == 2
-
-
 def test_rotations_at_once_lose_no_key(veilface, data, monkeypatch):
     assert veilface("keys", "list").status == 0
     read, together = read_key_file, threading.Barrier(4)

@@ -98,23 +98,6 @@ def test_a_changed_contract_is_refused(world, lift, public, tmp_path):
     assert "contract_id" in ran.stderr
 
 
-def test_other_decoys_and_other_weights_are_refused(world, public, tmp_path, yunet_pack_dir):
-    other = tmp_path / "other.veil"
-    made = run(
-        *("decoys", "build", world.labelled, "--pack", world.pack, "--out", other),
-        *("--data-dir", tmp_path / "d"),
-    )
-    assert made.status == 0
-    photo = world.photos(1, range(1))
-    base = ("lift", *photo, "--contract", public, "--out", tmp_path / "x")
-    ran = run(*base, "--pack", world.pack, "--generator", other)
-    assert ran.status == 1
-    assert "bound to the decoy source" in ran.stderr
-    ran = run(*base, "--pack", yunet_pack_dir, "--generator", world.data / "decoys.veil")
-    assert ran.status == 1
-    assert "the pack gives 128" in ran.stderr
-
-
 def test_decoys_of_another_model_are_refused_though_the_contract_names_them(
     world, public, tmp_path
 ):
@@ -133,12 +116,3 @@ def test_decoys_of_another_model_are_refused_though_the_contract_names_them(
     assert ran.status == 1
     assert "another model" in ran.stderr
     assert not (tmp_path / "x").exists()
-
-
-def test_the_contract_file_itself_does_as_well(world, tmp_path):
-    ran = run(
-        *("lift", *world.photos(1, range(1)), "--pack", world.pack, "--out", tmp_path / "x"),
-        *("--contract", world.data / "contract.json"),
-        *("--generator", world.data / "decoys.veil"),
-    )
-    assert ran.status == 0, ran.stderr

@@ -16,7 +16,7 @@ from models.pack import ModelPack
 from models.synthetic import draw_face, encode_photo
 from templates.contract.document import Contract
 from templates.keys.sealing import MasterKeyring
-from tests.api.cli.conftest import key_file, run
+from tests.api.cli.conftest import key_file
 from tests.models.graphs import fixed_face_detector, mean_liveness
 
 BOX = (16.0, 8.0, 96.0, 108.0)
@@ -241,11 +241,3 @@ def test_a_folder_named_liveness_is_a_data_set_by_its_path(veilface, tmp_path, m
     monkeypatch.chdir(tmp_path)
     ran = veilface("evaluate", "./liveness", "--pack", "none")
     assert "no protocol" in ran.stderr
-
-
-def test_models_inspect_shows_what_a_liveness_graph_is_fed(liveness_pack):
-    told = run("models", "inspect", liveness_pack, "--json").json
-    assert [graph["role"] for graph in told["graphs"]].count("liveness") == 1
-    fed = told["pack"]["liveness"][0]
-    assert (fed["file"], fed["crop_scale"], fed["size"]) == ("2.7_80x80_mean.onnx", 2.7, 80)
-    assert "liveness" in run("models", "inspect", liveness_pack).stdout

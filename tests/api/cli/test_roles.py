@@ -37,12 +37,6 @@ def test_the_sample_gets_nobody_whom_the_calibration_needs(
     assert not {photo.parent.name for photo in photos} & set(calibration)
 
 
-def test_the_split_does_not_depend_on_the_order_of_the_folder() -> None:
-    people = albums((140, 5))
-    again = dict(reversed(people.items()))
-    assert split_people(people)[0] == split_people(again)[0]
-
-
 def test_a_sample_of_too_few_people_is_none() -> None:
     """Decoys are adapted to 50 people or more: 45 have 300 photos."""
     people = albums((45, 7), (100, 8))

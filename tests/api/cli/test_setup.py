@@ -115,13 +115,6 @@ def test_nobody_is_in_two_roles(tmp_path: Path) -> None:
         assign_roles(labelled_folder(people), [faces], [people])
 
 
-def test_a_folder_inside_another_gives_each_photo_one_role(tmp_path: Path) -> None:
-    people = draw(tmp_path / "all" / "people", range(3), range(2))
-    draw(tmp_path / "all" / "others", range(10, 14), range(1))
-    roles = assign_roles(labelled_folder(people), [tmp_path / "all"])
-    assert len(roles.faces) == 4
-
-
 @pytest.fixture
 def prepared(
     world: World, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -4,19 +4,15 @@ import os
 import re
 import signal
 import socket
-import time
 from pathlib import Path
 from typing import Any
 
-import anyio
-import anyio.from_thread
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from api.http.app import VERSION, create_app
 from api.http.errors import ERROR_CODES
-from api.service.housekeeping import purge_regularly
-from api.service.metrics import exposition, step
+from api.service.metrics import exposition
 from templates.store.lockout import LockedOut
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, deploy, images, photo
@@ -153,47 +149,6 @@ def test_a_refusal_of_a_locked_subject_is_counted(
         assert client.get("/v1/subjects/a").status_code == 423
     assert rise("veilface_lockouts_total", kind="locked") == 2
     assert rise("veilface_lockouts_total", kind="disabled") == 1
-
-
-def test_a_failed_purge_is_counted() -> None:
-    class Broken:
-        def purge(self) -> bool:
-            raise OSError
-
-    failures: list[Exception] = []
-    before = value(samples(exposition().decode()), "veilface_purge_failures_total")
-
-    async def scenario() -> None:
-        with anyio.CancelScope() as purging:
-
-            def failed(error: Exception) -> None:
-                failures.append(error)
-                purging.cancel()
-
-            await purge_regularly(Broken(), on_failure=failed)  # type: ignore[arg-type]
-
-    anyio.run(scenario)
-    after = value(samples(exposition().decode()), "veilface_purge_failures_total")
-    assert after == before + 1
-    assert [type(each) for each in failures] == [OSError]
-
-
-def test_a_step_is_measured_even_if_it_fails() -> None:
-    name = "a step of this test"
-
-    def fail() -> None:
-        time.sleep(0.02)
-        raise KeyError
-
-    begun = time.perf_counter()
-    with pytest.raises(KeyError), step(name):
-        fail()
-    took = time.perf_counter() - begun
-    found = samples(exposition().decode())
-    assert value(found, "veilface_step_seconds_count", step=name) == 1
-    assert 0.02 <= value(found, "veilface_step_seconds_sum", step=name) <= took
-    assert value(found, "veilface_step_seconds_bucket", step=name, le="0.01") == 0
-    assert value(found, "veilface_step_seconds_bucket", step=name, le="+Inf") == 1
 
 
 def test_operations_md_explains_every_metric_and_no_other() -> None:

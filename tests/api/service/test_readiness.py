@@ -79,20 +79,6 @@ def test_after_a_failed_write_a_write_must_succeed(both: tuple[Client, Deploymen
     assert client.put(**enroll).status_code == 201
 
 
-def test_a_trial_write_changes_nothing(both: tuple[Client, Deployment]) -> None:
-    client, _ = both
-    store = client.app.state.runtime.store
-    row = sa.text("SELECT * FROM secrets ORDER BY name")
-
-    def rows() -> list[Any]:
-        return store.database.read(lambda each: [tuple(r) for r in each.execute(row)])
-
-    before = rows()
-    store.ping_write()
-    assert rows() == before
-    assert before
-
-
 def test_after_a_failed_inference_one_must_succeed(
     client: Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -150,32 +136,6 @@ def test_recovery_is_seen_without_anybody_asking(
     lines = [json.loads(line) for line in capfd.readouterr().err.splitlines()]
     said = [line["event"] for line in lines if line["event"].startswith("store")]
     assert said == ["store failed", "store is available again"]
-
-
-def test_a_key_file_that_broke_is_logged_once(
-    deployment: Deployment, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(
-        "api.service.readiness.Readiness.watch.__kwdefaults__", {"every_s": 0.05}, raising=False
-    )
-    file = deployment.settings.resolved_master_key_file
-    kept = file.read_bytes()
-    logged = ""
-
-    def said() -> int:
-        nonlocal logged
-        logged += capfd.readouterr().err
-        return logged.count('"event": "the master keys changed and cannot be read"')
-
-    with Client(create_app(deployment.settings)) as client:
-        try:
-            file.write_bytes(b"")
-            wait_until(lambda: said() == 1, what="the line about the keys")
-            time.sleep(0.3)
-            assert said() == 1
-            assert client.get(READY).status_code == 200
-        finally:
-            file.write_bytes(kept)
 
 
 def _store_error() -> Exception:

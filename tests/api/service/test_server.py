@@ -2,10 +2,7 @@
 
 import signal
 import socket
-import subprocess
-import sys
 import threading
-import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -13,12 +10,10 @@ from pathlib import Path
 import httpx
 import pytest
 
-from api.http.bodies import MAX_IMAGE_BYTES
 from api.http.errors import DatabaseAway
 from api.service.server import RETRY_S, open_patiently
-from tests.api.deployment import bearer, deploy, environment_of, images, photo
+from tests.api.deployment import bearer, deploy, images, photo
 from tests.api.server_process import Server
-from tests.api.shapes import assert_error
 from tests.patience import PATIENCE_S, wait_until
 from tests.ports import free_port
 
@@ -39,25 +34,6 @@ def http(server: Server) -> Iterator[httpx.Client]:
     ) as client:
         assert client.put("/v1/subjects/a/enrollment", files=images(photo(1))).status_code == 201
         yield client
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("seconds", [0.0, 0.5])
-def test_a_start_that_is_stopped_leaves_nothing(tmp_path: Path, seconds: float) -> None:
-    deployment = deploy(tmp_path, workers=2, port=free_port(), compute_slots=1)
-    temporary = tmp_path / "temporary"
-    temporary.mkdir()
-    process = subprocess.Popen(
-        [sys.executable, "-m", "veilface", "serve"],
-        cwd=Path(__file__).resolve().parents[3],
-        env={**environment_of(deployment.settings), "TMPDIR": str(temporary)},
-        stderr=subprocess.DEVNULL,
-    )
-    wait_until(lambda: any(temporary.iterdir()), what="the folder that workers count in")
-    time.sleep(seconds)
-    process.terminate()
-    assert process.wait(timeout=PATIENCE_S) == 0
-    assert list(temporary.iterdir()) == []
 
 
 @pytest.mark.usefixtures("http")
@@ -82,39 +58,6 @@ def test_workers_share_the_database_and_nothing_else(server: Server) -> None:
         return {line["pid"] for line in server.lines() if line["event"] == "started"}
 
     wait_until(lambda: len(started()) == 2, what="both workers")
-
-
-def test_a_large_body_gets_its_answer(server: Server, http: httpx.Client) -> None:
-    image = photo(1) + b"\x00" * MAX_IMAGE_BYTES
-    answer = http.put("/v1/subjects/a/enrollment", files=images(image))
-    assert_error(answer, 413, "image_too_large")
-    answer = http.put("/v1/subjects/a/enrollment", files=images(*[image[:-100_000]] * 5))
-    assert_error(answer, 413, "request_too_large")
-
-    def chunks() -> Iterator[bytes]:
-        for _ in range(64):
-            yield b"x" * 1024 * 1024
-
-    answer = http.put(
-        "/v1/subjects/a/enrollment",
-        content=chunks(),
-        headers={"Content-Type": "application/json"},
-    )
-    assert_error(answer, 413, "request_too_large")
-    assert http.get("/health/live").status_code == 200
-
-
-def test_a_client_that_goes_away_does_no_harm(server: Server, http: httpx.Client) -> None:
-    for _ in range(5):
-        with socket.create_connection(("127.0.0.1", server.port)) as raw:
-            raw.sendall(
-                b"PUT /v1/subjects/a/enrollment HTTP/1.1\r\nHost: x\r\n"
-                + f"Authorization: Bearer {server.deployment.token}\r\n".encode()
-                + b"Content-Type: multipart/form-data; boundary=b\r\nContent-Length: 100000\r\n\r\n"
-                + b'--b\r\nContent-Disposition: form-data; name="images"; filename="f"\r\n\r\nabc'
-            )
-    assert http.get("/health/ready").status_code == 200
-    assert http.get("/v1/subjects/a").status_code == 200
 
 
 def test_a_client_that_asks_first_is_told_at_once(server: Server) -> None:

@@ -31,10 +31,3 @@ def test_any_path_is_read_back_in_full(name: str, tmp_path: Path) -> None:
         "providers": ["cuda", "cpu"],
         "database_url": f"sqlite:///{name}",
     }
-
-
-def test_a_relative_path_does_not_depend_on_where_it_is_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert tomllib.loads(settings_text({"pack": Path("pack")})) == {"pack": str(tmp_path / "pack")}

@@ -1,7 +1,7 @@
 """A start that cannot work ends in one sentence; one that works needs little."""
 
 import stat
-from collections.abc import MutableMapping
+from collections.abc import Callable, MutableMapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,6 @@ from api.http.schemas import VerifyAnswer
 from api.service.opening import (
     database_in_use,
     file_sealer,
-    key_beside_database,
     open_keyring,
     open_store,
     try_inference,
@@ -27,7 +26,6 @@ from api.service.runtime import Runtime
 from api.settings import Settings
 from models.pack import ModelPack
 from templates.contract.document import Rate
-from templates.contract.nobody import Nobody
 from templates.contract.verdict import Verdict
 from templates.decoys import DecoyGenerator
 from templates.keys.sealing import MasterKeyring
@@ -78,63 +76,52 @@ def test_the_master_key_is_made_once_and_private(tmp_path: Path) -> None:
     assert not settings.data_dir.exists()
 
 
-def test_a_master_key_beside_the_database_is_said(tmp_path: Path) -> None:
-    data, elsewhere = tmp_path / "data", tmp_path / "elsewhere"
-    data.mkdir()
-    default = Settings(data_dir=data)
-    assert key_beside_database(default) is None
-    said = str(key_beside_database(Settings(data_dir=data, master_key_file=data / "master.key")))
-    assert str(data / "master.key") in said
-    assert "move it" in said
-    assert "\n" not in said
-    tmp_path.joinpath("link").symlink_to(data)
-    beside = {"master_key_file": tmp_path / "link" / "master.key"}
-    for url in (f"sqlite:///{data}/x.db", f"sqlite+pysqlite:///{data}/x.db"):
-        assert key_beside_database(Settings(data_dir=elsewhere, database_url=url, **beside))
-    for other in (
-        Settings(data_dir=data, database_url=f"sqlite:///{elsewhere}/x.db"),
-        Settings(data_dir=data, database_url="postgresql://u@127.0.0.1:1/x"),
-        Settings(data_dir=data, master_key_variable="KEY"),
+def edited(contract: Path) -> None:
+    text = contract.read_text()
+    assert '"score_threshold": 2.5' in text
+    contract.write_text(text.replace('"score_threshold": 2.5', '"score_threshold": 0.5'))
+
+
+def of_another_contract(decoys: Path) -> None:
+    rng = np.random.default_rng(99)
+    DecoyGenerator.fit(unit(rng.normal(size=(300, N)))).save(decoys)
+
+
+def of_another_deployment(master_key: Path) -> None:
+    master_key.unlink()
+    MasterKeyring.create(master_key)
+
+
+@pytest.mark.parametrize(
+    ("file", "spoil", "said"),
+    [
+        ("master_key", Path.unlink, "missing, but the database holds data"),
+        ("master_key", of_another_deployment, "contract file"),
+        ("master_key", lambda file: file.chmod(0o644), "chmod 600"),
+        ("contract", Path.unlink, "veilface calibrate"),
+        ("contract", lambda file: file.write_text("{}"), "contract.json cannot be used"),
+        ("contract", edited, "contract.json cannot be used"),
+        ("decoys", Path.unlink, "there is no decoys file"),
+        ("decoys", of_another_contract, "is not the contract's"),
+    ],
+)
+def test_a_file_that_does_not_fit_is_named(
+    fresh: Deployment, file: str, spoil: Callable[[Path], object], said: str
+) -> None:
+    spoil(getattr(fresh.settings, f"resolved_{file}_file"))
+    assert said in refused(fresh.settings)
+    if spoil == Path.unlink:
+        assert not getattr(fresh.settings, f"resolved_{file}_file").exists()
+
+
+def test_settings_that_do_not_fit_are_named(fresh: Deployment, tmp_path: Path) -> None:
+    (tmp_path / "not-a-database").write_bytes(b"hello" * 1000)
+    for changes, said in (
+        ({"pack": tmp_path / "absent"}, "absent"),
+        ({"providers": ("cuda",)}, "cuda"),
+        ({"database_url": f"sqlite:///{tmp_path / 'not-a-database'}"}, "database"),
     ):
-        assert key_beside_database(other) is None
-
-
-def test_a_lost_master_key_is_not_replaced(fresh: Deployment) -> None:
-    fresh.settings.resolved_master_key_file.unlink()
-    assert "missing, but the database holds data" in refused(fresh.settings)
-    assert not fresh.settings.resolved_master_key_file.exists()
-
-
-def test_another_master_key_is_refused(fresh: Deployment, tmp_path: Path) -> None:
-    other = Settings(data_dir=tmp_path / "other")
-    open_keyring(other)
-    assert "contract file" in refused(
-        changed(fresh, master_key_file=other.resolved_master_key_file)
-    )
-
-
-def test_a_readable_master_key_is_refused(fresh: Deployment) -> None:
-    fresh.settings.resolved_master_key_file.chmod(0o644)
-    assert "chmod 600" in refused(fresh.settings)
-
-
-def test_no_contract(fresh: Deployment) -> None:
-    fresh.settings.resolved_contract_file.unlink()
-    assert "veilface calibrate" in refused(fresh.settings)
-
-
-def test_a_broken_contract(fresh: Deployment) -> None:
-    path = fresh.settings.resolved_contract_file
-    path.write_text("{}")
-    assert str(path) in refused(fresh.settings)
-
-
-def test_an_edited_contract(fresh: Deployment) -> None:
-    path = fresh.settings.resolved_contract_file
-    edited = path.read_text().replace('"score_threshold": 2.5', '"score_threshold": 0.5')
-    assert edited != path.read_text()
-    path.write_text(edited)
-    assert "contract file" in refused(fresh.settings)
+        assert said in refused(changed(fresh, **changes)).lower()
 
 
 def test_another_pack_is_named_beside_the_contract(fresh: Deployment, tmp_path: Path) -> None:
@@ -147,14 +134,6 @@ def test_another_pack_is_named_beside_the_contract(fresh: Deployment, tmp_path: 
     assert fresh.contract.binding.embedder_sha256[:16] in sentence
 
 
-def test_no_pack_where_one_is_named(fresh: Deployment, tmp_path: Path) -> None:
-    assert "absent" in refused(changed(fresh, pack=tmp_path / "absent"))
-
-
-def test_an_absent_accelerator_is_an_error(fresh: Deployment) -> None:
-    assert "cuda" in refused(changed(fresh, providers=("cuda",))).lower()
-
-
 def test_a_pack_that_fails_on_its_first_picture(
     fresh: Deployment, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -164,18 +143,6 @@ def test_a_pack_that_fails_on_its_first_picture(
     monkeypatch.setattr(pack, "embed", lambda crops: np.zeros((1, N), np.float32))
     with pytest.raises(StartError, match="unit vector"):
         try_inference(pack)
-
-
-def test_decoys_of_another_contract(fresh: Deployment) -> None:
-    rng = np.random.default_rng(99)
-    other = DecoyGenerator.fit(unit(rng.normal(size=(300, N))))
-    other.save(fresh.settings.resolved_decoys_file)
-    assert "decoys file" in refused(fresh.settings)
-
-
-def test_absent_decoys(fresh: Deployment) -> None:
-    fresh.settings.resolved_decoys_file.unlink()
-    assert "there is no decoys file" in refused(fresh.settings)
 
 
 @pytest.mark.parametrize(
@@ -197,19 +164,6 @@ def test_a_wrong_database_is_one_sentence_without_the_password(
             open_keyring(changed(fresh, database_url=url, master_key_file=tmp_path / "absent"))
         assert "hunter2" not in str(caught.value)
         assert not (tmp_path / "absent").exists()
-
-
-def test_a_database_of_another_program(fresh: Deployment, tmp_path: Path) -> None:
-    path = tmp_path / "not-a-database"
-    path.write_bytes(b"hello" * 1000)
-    assert "database" in refused(changed(fresh, database_url=f"sqlite:///{path}"))
-
-
-def test_whether_a_database_is_in_use(both: tuple[Client, Deployment], tmp_path: Path) -> None:
-    _, deployment = both
-    assert database_in_use(deployment.settings.resolved_database_url)
-    assert not database_in_use(f"sqlite:///{tmp_path / 'none.db'}")
-    assert not (tmp_path / "none.db").exists()
 
 
 def test_another_applications_rows_do_not_count(tmp_path: Path, database_url: str) -> None:
@@ -272,15 +226,6 @@ def test_without_a_pack_templates_and_embeddings_work(fresh: Deployment) -> None
         descriptor = unit(np.random.default_rng([5, 0]).normal(size=(1, N)))[0]
         answer = client.post(f"{base}/verify", json={"embedding": descriptor.tolist()})
         assert answer.json()["decision"] == "accept"
-
-
-def test_a_failed_start_is_logged_in_one_sentence(
-    fresh: Deployment, capfd: pytest.CaptureFixture[str]
-) -> None:
-    fresh.settings.resolved_contract_file.unlink()
-    with pytest.raises(StartError), Client(create_app(fresh.settings)):
-        pass
-    assert "start failed: there is no contract file" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize("error", [RuntimeError("hunter2"), StartError("no contract")])
@@ -387,18 +332,3 @@ def test_the_cohort_is_lifted_before_a_probe_asks_for_it(fresh: Deployment) -> N
         runtime = client.app.state.runtime
         assert runtime.contract.takes_lifted_probes
         wait_until(lambda: "_cohort" in vars(runtime.nobody), what="a cohort")
-
-
-def test_a_cohort_that_could_not_be_lifted_stops_nothing(
-    fresh: Deployment, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def fails(*_: object, **__: object) -> None:
-        raise MemoryError
-
-    with monkeypatch.context() as context:
-        context.setattr(Nobody, "cohort", property(fails))
-        with Client(create_app(fresh.settings)) as client:
-            wait_until(lambda: "cohort not lifted" in capsys.readouterr().err, what="a log line")
-            assert client.get("/health/ready").status_code == 200
-            context.undo()
-            assert len(client.app.state.runtime.nobody.cohort) > 0

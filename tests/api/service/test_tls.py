@@ -16,7 +16,6 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from api.http.errors import StartError
 from api.service.server import tls_options
 from api.settings import Settings, load_settings
-from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, deploy, environment_of
 from tests.api.server_process import Server
 from tests.certificates import self_signed
@@ -90,10 +89,6 @@ def test_the_service_speaks_tls(tmp_path: Path) -> None:
         assert httpx.get(f"{url}/health/live", verify=old, timeout=PATIENCE_S).status_code == 200
 
 
-def test_without_tls_no_header_asks_for_it(client: Client) -> None:
-    assert "strict-transport-security" not in client.get("/health/live").headers
-
-
 def test_a_key_that_others_may_read_is_refused(tmp_path: Path) -> None:
     for mode in (0o640, 0o604, 0o660):
         certificate, key = self_signed(tmp_path, mode=mode)
@@ -121,9 +116,3 @@ def test_files_that_do_not_belong_together_are_refused(tmp_path: Path) -> None:
     ):
         with pytest.raises(StartError, match=sentence):
             tls_options(load_settings(tls_certificate=certificate, tls_key=key))
-
-
-def test_a_certificate_needs_a_key_and_a_key_a_certificate(tmp_path: Path) -> None:
-    for half in ({"tls_certificate": "a"}, {"tls_key": "a"}):
-        with pytest.raises(StartError, match="or neither"):
-            load_settings(**half)
