@@ -3,7 +3,7 @@
 Given vectors (embeddings, decoys, model inputs) and byte strings (photo files, pixels, tokens),
 :class:`LeakSearch` finds any run of them in a blob:
 
-- numbers as float16, bfloat16, float32 or float64, in either byte order, at any byte position;
+- numbers as float16, float32 or float64, little-endian, at any byte position;
 - numbers as decimal text of three digits after the point or more (JSON, CSV, a printed array);
 - byte strings as they are;
 - all of that inside base64 (either alphabet, any alignment) and hexadecimal (either case).
@@ -20,7 +20,6 @@ import base64
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -32,12 +31,12 @@ LEAST = RUN + STRIDE - 1
 BYTES = 16  # bytes of a byte string that must agree
 BYTE_STRIDE = 16
 TEXT_RUN = 6
-RELATIVE = 4e-3  # float16 and bfloat16 round by at most 2⁻⁹
+RELATIVE = 1e-3  # float16 rounds by at most 2⁻¹¹
 
 _HASH = np.uint64(0x9E3779B97F4A7C15)
 _TABLE_BITS = 22
 _MOST_AS_TEXT = 4096  # numbers of a vector: nobody prints a picture as decimals
-_FLOATS = {"float16": 2, "bfloat16": 2, "float32": 4, "float64": 8}
+_FLOATS = {"float16": 2, "float32": 4, "float64": 8}
 _NUMBER = re.compile(rb"\.(\d{3,20})(?:[eE]([-+]?\d{1,3}))?")
 _BEFORE = re.compile(rb"-?\d{0,3}$")
 _BASE64 = re.compile(rb"[A-Za-z0-9+/_-]{24,}")
@@ -102,13 +101,10 @@ class LeakSearch:
         raw = np.frombuffer(blob, dtype=np.uint8)
         if len(raw) >= BYTES:
             yield from self._find_strings(raw)
-        first, second = raw[:-1].astype(np.uint64), raw[1:].astype(np.uint64)
-        for little in (True, False):
-            low, high = (first, second) if little else (second, first)
-            halves = low | high << np.uint64(8)
-            for name, size in _FLOATS.items():
-                if len(raw) >= RUN * size:
-                    yield from self._find_floats(raw, halves, name, little=little)
+        halves = raw[:-1].astype(np.uint64) | raw[1:].astype(np.uint64) << np.uint64(8)
+        for name, size in _FLOATS.items():
+            if len(raw) >= RUN * size:
+                yield from self._find_floats(raw, halves, name)
         yield from self._find_text(blob)
 
     def _find_strings(self, raw: NDArray[np.uint8]) -> Iterator[Leak]:
@@ -121,17 +117,16 @@ class LeakSearch:
                 yield Leak(self._string_names[self._chunk_owner[row]], "bytes", offset)
 
     def _find_floats(
-        self, raw: NDArray[np.uint8], halves: NDArray[np.uint64], name: str, *, little: bool
+        self, raw: NDArray[np.uint8], halves: NDArray[np.uint64], name: str
     ) -> Iterator[Leak]:
         size = _FLOATS[name]
-        # The upper two bytes of a number stand last in little-endian order, first in big-endian.
-        skip = size - 2 if little else 0
+        # The upper two bytes of a number stand last.
+        skip = size - 2
         count = len(raw) - RUN * size + 1
         keys = np.zeros(count, dtype=np.uint64)
         for place in range(RUN):
             start = skip + place * size
             keys |= halves[start : start + count] << np.uint64(16 * place)
-        order = "little" if little else "big"
         for offset, row in self._tables[name].hits(keys):
             owner, start = self._window_owner[row], self._window_start[row]
             before = min(LEAST - RUN, start, offset // size)
@@ -139,10 +134,10 @@ class LeakSearch:
             data = data[: len(data) // size * size]
             wanted = self._flat[owner][start - before : start + LEAST]
             count = min(len(data) // size, len(wanted))
-            numbers = _numbers(data[: count * size].tobytes(), name, little=little)
+            numbers = _numbers(data[: count * size].tobytes(), name)
             agree = np.isclose(numbers, wanted[:count], rtol=RELATIVE, atol=1e-7)
             if _longest_run(agree) >= min(LEAST, len(self._flat[owner])):
-                yield Leak(self._names[owner], f"{name}, {order}-endian", offset)
+                yield Leak(self._names[owner], name, offset)
 
     def _find_text(self, blob: bytes) -> Iterator[Leak]:
         if self._text is None:
@@ -224,30 +219,20 @@ def _chunks_of(strings: Sequence[bytes]) -> tuple[NDArray[np.uint8], NDArray[np.
     return np.ascontiguousarray(np.concatenate(parts)), np.concatenate(owners)
 
 
-def as_bytes(values: ArrayLike, name: str, *, little: bool) -> bytes:
-    """Numbers as they would stand in a file, for `name` in float16, bfloat16, float32, float64."""
-    order: Literal["<", ">"] = "<" if little else ">"
-    if name == "bfloat16":
-        bits = np.asarray(values, dtype="<f4").view("<u4")
-        halves = ((bits + np.uint32(0x8000)) >> np.uint32(16)).astype(f"{order}u2")
-        return halves.tobytes()
-    return np.asarray(values, dtype=np.dtype(name).newbyteorder(order)).tobytes()
+def as_bytes(values: ArrayLike, name: str) -> bytes:
+    """Numbers as they would stand in a file, for `name` float16, float32 or float64."""
+    return np.asarray(values, dtype=np.dtype(name).newbyteorder("<")).tobytes()
 
 
-def _numbers(data: bytes, name: str, *, little: bool) -> NDArray[np.float64]:
-    order: Literal["<", ">"] = "<" if little else ">"
-    if name == "bfloat16":
-        bits = np.frombuffer(data, dtype=f"{order}u2").astype(np.uint32) << np.uint32(16)
-        return bits.view(np.float32).astype(np.float64)
-    stored = np.frombuffer(data, dtype=np.dtype(name).newbyteorder(order))
+def _numbers(data: bytes, name: str) -> NDArray[np.float64]:
     with np.errstate(invalid="ignore"):
-        return stored.astype(np.float64)
+        return np.frombuffer(data, dtype=np.dtype(name).newbyteorder("<")).astype(np.float64)
 
 
 def _top_halves(windows: NDArray[np.float64], name: str) -> NDArray[np.uint64]:
     """Sign, exponent and first bits of the mantissa: 16 bits a number, blind to the last bits."""
     size = _FLOATS[name]
-    stored = np.frombuffer(as_bytes(windows.ravel(), name, little=True), dtype=np.uint8)
+    stored = np.frombuffer(as_bytes(windows.ravel(), name), dtype=np.uint8)
     tops = stored.reshape(-1, size)[:, size - 2 :].astype(np.uint64)
     return (tops[:, 0] | tops[:, 1] << np.uint64(8)).reshape(-1, RUN)
 

@@ -111,13 +111,3 @@ def test_what_is_planted_is_found(text: str, missing: int, tmp_path: Path) -> No
         "# Page\n\n## 1. One\n\n### 1.2 Two\n\n## 2. Two\n\n## The `last`\n"
     )
     assert len([*unresolved(text, tmp_path / "source.py", tmp_path)]) == missing
-
-
-def test_every_source_that_a_page_names_exists() -> None:
-    named = [
-        (page.name, path)
-        for page in (*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"))
-        for path in re.findall(r"`([a-z]\w*/[\w/.-]+\.(?:py|js))`", page.read_text("utf-8"))
-    ]
-    assert len(named) > 30
-    assert [(page, path) for page, path in named if not (ROOT / path).exists()] == []

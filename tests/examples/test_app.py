@@ -345,7 +345,7 @@ def test_a_browser_sends_a_private_template_and_nothing_else_of_a_face(
         embedding = pack.embed_photo(shown["camera at login"]).embedding
         for recording, data, what in (
             (app, own[0].read_bytes(), f"photo {own[0].name}"),
-            (place.service, as_bytes(embedding, "float32", little=True), "camera at login"),
+            (place.service, as_bytes(embedding, "float32"), "camera at login"),
         ):
             page.evaluate(PLANT, [recording.url + "/planted", base64.b64encode(data).decode()])
             assert any(what in leak.what for leak in search.find(recording.sent)), what

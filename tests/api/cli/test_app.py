@@ -43,10 +43,6 @@ def at_once(*arguments: str, **environment: str) -> tuple[str, int]:
     return "\n".join(lines) + done.stderr, status
 
 
-def test_the_version_is_there_at_once() -> None:
-    assert at_once("--version") == (f"veilface {STATED}", 0)
-
-
 def test_the_help_is_there_at_once() -> None:
     shown, status = at_once("--help")
     assert status == 0

@@ -61,9 +61,12 @@ def part(
     text = "\n".join([f"{FOLDS}\t{PER_CLASS}", *chosen])
     (root / "lfw" / "pairs.txt").write_text(text, encoding="utf-8")
     decoys, data = root / "decoys.veil", root / "data"
+    (root / "faces").mkdir()
+    for photo in sorted((fairface / "train").glob("*.jpg"))[::100]:
+        (root / "faces" / photo.name).symlink_to(photo)
     built = run(
-        *("decoys", "build", fairface / "train", "--pack", mbf_pack_dir, "--kind", "pool"),
-        *("--aligned", "--limit", "40", "--data-dir", data, "--out", decoys),
+        *("decoys", "build", root / "faces", "--pack", mbf_pack_dir, "--kind", "pool"),
+        *("--aligned", "--data-dir", data, "--out", decoys),
     )
     assert built.status == 0, built.stderr
     # The cache goes by content: what another run reads differently is not found in it.

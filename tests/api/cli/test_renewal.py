@@ -108,28 +108,6 @@ def test_it_renews_all_and_says_what_is_left_to_do(used: tuple[Path, dict[str, A
     assert run("audit-log", "verify", "--anchor", anchor, "--data-dir", data).status == 0
 
 
-def test_master_keys_of_a_variable_are_put_there_first(
-    used: tuple[Path, dict[str, Any]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    data, known = used
-    old = key_file(data).read_text()
-    MasterKeyring.create(tmp_path / "fresh.key")
-    fresh = (tmp_path / "fresh.key").read_text()
-    key_file(data).unlink()
-    variable = ("--master-key-variable", "SOME_VARIABLE")
-    monkeypatch.setenv("SOME_VARIABLE", old)
-    refused = renew(data, *variable)
-    assert refused.status == 2
-    assert "put a new key in front" in refused.stderr
-    monkeypatch.setenv("SOME_VARIABLE", f"{fresh.strip()} {old.strip()}")
-    ran = renew(data, *variable)
-    assert ran.status == 0, ran.stderr
-    assert "Drop the older master keys where they come from" in ran.stdout
-    key_file(data).write_text(fresh)
-    key_file(data).chmod(0o600)
-    assert_renewed(data, known)
-
-
 class Steps:
     """Counts the steps of a process that reach the disk, and kills it before one of them."""
 

@@ -60,8 +60,3 @@ def test_a_wrong_setting_is_one_sentence(tmp_path):
     absent = ran("--config", str(tmp_path / "absent.toml"))
     assert absent.exit_code == 1
     assert "is not a file" in absent.stderr
-
-
-def test_a_command_takes_the_settings_it_names_and_no_other():
-    result = ran("--port", "80", names=("data_dir",))
-    assert result.exit_code == 2

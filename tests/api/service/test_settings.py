@@ -40,10 +40,6 @@ def test_the_table_of_the_documentation_is_the_declaration() -> None:
     assert settings_table() in (DOCS / "settings.md").read_text(encoding="utf-8")
 
 
-def test_every_setting_has_a_help_text() -> None:
-    assert [name for name, field in Settings.model_fields.items() if not field.description] == []
-
-
 def test_flags_win_over_environment_over_file(
     elsewhere: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
