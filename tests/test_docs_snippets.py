@@ -7,7 +7,6 @@ clients and the examples in tests of their own.
 import json
 import re
 import shlex
-import subprocess
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,8 +22,6 @@ from api.cli.app import COMMANDS, app, load
 from api.settings import Settings
 from models.pack_file import read_pack_file
 from tests.pages import FENCED, ROOT, Snippet, pages, snippets
-from tests.ports import free_port
-from tests.reliability.proxy import require_nginx, write_configuration
 from verify.evaluation.embeddings_file import read_embeddings
 
 PUNCTUATION = set("();<>|&")
@@ -171,18 +168,6 @@ def test_toml_is_read(snippet: Snippet, tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.chdir(tmp_path)
     assert set(values) <= set(Settings.model_fields)
     Settings(**values)
-
-
-@of_kind("nginx")
-def test_nginx_accepts_it(snippet: Snippet, tmp_path: Path) -> None:
-    require_nginx()
-    path = write_configuration(snippet.code, tmp_path, f"127.0.0.1:{free_port()}")
-    done = subprocess.run(
-        ["nginx", "-t", "-q", "-p", tmp_path, "-c", path, "-e", tmp_path / "error.log"],
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stderr
 
 
 def test_the_embeddings_file_of_the_page_is_read(

@@ -122,32 +122,6 @@ def test_the_real_path_from_weights_to_a_receipt(
     assert {**example, **ids_of(answer)} == answer
 
 
-def test_the_evaluation_on_a_part_of_lfw(
-    newcomer: tuple[Path, dict[str, str]], mbf_pack_dir: Path, fairface: Path, lfw_aligned: Path
-) -> None:
-    folder, env = newcomer
-    lfw = folder / "lfw"
-    lfw.mkdir()
-    faces = some_faces(folder, fairface, 150)
-    header, *lines = (lfw_aligned / "pairs.txt").read_text().splitlines()
-    assert header == "10\t300"
-    starts = range(0, len(lines), 300)
-    kept = [line for start in starts for line in lines[start : start + 6]]
-    (lfw / "pairs.txt").write_text("\n".join(["10\t6", *kept, ""]))
-    for name in {part for line in kept for part in line.split("\t") if not part.isdecimal()}:
-        (lfw / name).symlink_to(lfw_aligned / name)
-
-    activate = f". .venv/bin/activate\nPACK={mbf_pack_dir}"
-    shell(f"{activate}\nveilface decoys build {faces} --pack $PACK", folder, env)
-    (block,) = (each for each in FENCE.findall(EVALUATION.read_text()) if "LFW=~" in each)
-    shell(with_values(block, {"PACK": str(mbf_pack_dir), "LFW": str(lfw)}), folder, env)
-    results = json.loads((folder / "lfw-results" / "results.json").read_text())
-    assert results["datasets"][0]["pairs"] == 120
-    table = readme_table([results])
-    assert "120 pairs of LFW" in table
-    assert "| adversarial (generator)" in table
-
-
 def test_the_results_table_is_that_of_the_results_in_the_repository() -> None:
     folder = ROOT / "docs" / "results"
     results = [json.loads((folder / name).read_text(encoding="utf-8")) for name in KEPT]

@@ -75,12 +75,7 @@ def changed(checkout: Path) -> str:
     return "1 files are not as they were committed"
 
 
-def tagged_otherwise(checkout: Path) -> str:
-    git(checkout, "tag", "v1.9.0")
-    return "the commit is tagged v1.9.0, and pyproject.toml says 1.10.0"
-
-
-@pytest.mark.parametrize("spoil", [undescribed, changed, tagged_otherwise])
+@pytest.mark.parametrize("spoil", [undescribed, changed])
 def test_there_are_no_notes_where_there_is_nothing_to_release(checkout: Path, spoil: Any) -> None:
     reason = spoil(checkout)
     written = notes(checkout)

@@ -86,11 +86,6 @@ def test_the_token_alone_is_on_stdout_or_in_a_private_file(veilface, store, tmp_
     assert store.api_keys.verify(file.read_text().strip()) is not None
 
 
-def test_a_key_needs_rights_that_exist(veilface):
-    assert veilface("keys", "create").status == 2
-    assert veilface("keys", "create", "--right", "everything").status == 2
-
-
 def test_the_master_key_is_made_once(tmp_path):
     file = tmp_path / "deep" / "key"
     made = run("keys", "master", "--master-key-file", file, "--json")

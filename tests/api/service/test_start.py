@@ -46,7 +46,6 @@ from tests.api.deployment import (
     write_pack,
 )
 from tests.api.shapes import assert_answer, assert_error
-from tests.patience import wait_until
 
 
 @pytest.fixture
@@ -255,18 +254,6 @@ def test_the_server_is_not_handed_the_text_of_a_failed_start(
     assert type(error).__name__ in logged
 
 
-def test_recalibration_keeps_the_templates(fresh: Deployment) -> None:
-    with Client(create_app(fresh.settings), headers=bearer(fresh.token)) as client:
-        client.put("/v1/subjects/a/enrollment", files=images(photo(1)))
-    assert fresh.settings.pack is not None
-    again = make_contract(ModelPack.load(fresh.settings.pack, threads=1), fresh.source)
-    again.save(fresh.settings.resolved_contract_file, file_sealer(open_keyring(fresh.settings)))
-    assert again.contract_id == fresh.contract.contract_id
-    with Client(create_app(fresh.settings), headers=bearer(fresh.token)) as client:
-        probe = client.post("/v1/subjects/a/verify", files=images(photo(1), name="image"))
-        assert probe.json()["decision"] == "accept"
-
-
 def test_a_template_of_an_older_contract_is_refused(fresh: Deployment) -> None:
     with Client(create_app(fresh.settings), headers=bearer(fresh.token)) as client:
         client.put("/v1/subjects/a/enrollment", files=images(photo(1)))
@@ -325,10 +312,3 @@ def test_privacy_that_is_not_proven_is_served_unless_it_is_required(
     refusal = run(*check, "--require-private")
     assert refusal.status == 1
     assert why in refusal.stderr
-
-
-def test_the_cohort_is_lifted_before_a_probe_asks_for_it(fresh: Deployment) -> None:
-    with Client(create_app(fresh.settings)) as client:
-        runtime = client.app.state.runtime
-        assert runtime.contract.takes_lifted_probes
-        wait_until(lambda: "_cohort" in vars(runtime.nobody), what="a cohort")
