@@ -19,37 +19,8 @@ def shown_rate(rate: Rate) -> str:
 
 def verdict_lines(verdict: Verdict | None) -> list[str]:
     """Say in a line each how private and how accurate a contract is, also in the worst group."""
-    if verdict is None:
-        return ["Privacy:  not measured.", "Accuracy: not judged.", "Groups:   not measured."]
-    return [
-        _privacy_line(verdict.privacy),
-        _accuracy_line(verdict.accuracy),
-        f"{_groups_line(verdict.groups)} {_CHILDREN}",
-    ]
-
-
-def _privacy_line(privacy: Judgement) -> str:
-    basis = privacy.basis
-    upper = "" if privacy.upper is None else f", and at most {100 * privacy.upper:.2g} % by chance"
-    most = "" if privacy.bound is None else f" and {100 * privacy.bound:.3g} %"
-    return (
-        f"Privacy:  {privacy.status}. The strongest thief, with {_attacker(privacy)}, finds a "
-        f"match for {shown_rate(privacy.rate)} of the templates at m = {basis['m']} of "
-        f"{basis['axes']} axes{upper}; limits {100 * privacy.limit:.3g}{most}"
-        f"{'' if most else ' %'}.{_shortfall(privacy)}"
-    )
-
-
-def _accuracy_line(accuracy: Judgement | None) -> str:
-    if accuracy is None:
-        return "Accuracy: not measured: nobody has two photos."
-    basis = accuracy.basis
-    return (
-        f"Accuracy: {accuracy.status}. {shown_rate(accuracy.rate)} of genuine probes are rejected "
-        f"at {basis['level']}, with {basis['enrolled_photos']} photos enrolled and "
-        f"{basis['probe_photos']} shown; limit {100 * accuracy.limit:.3g} %."
-        f"{_not_acquired(accuracy)}{_shortfall(accuracy)}"
-    )
+    groups = None if verdict is None else verdict.groups
+    return [*plain_lines(verdict), f"{_groups_line(groups)} {_CHILDREN}"]
 
 
 # As measured: docs/results/children.md.
@@ -59,16 +30,17 @@ _CHILDREN = "Of children below about ten years no level holds that was set on ad
 def _groups_line(groups: Judgement | None) -> str:
     if groups is None:
         return (
-            "Groups:   not measured: nobody is labelled (`veilface calibrate` takes --labels), or "
+            "Groups: not measured: nobody is labelled (`veilface calibrate` takes --labels), or "
             "too few in every group."
         )
     basis = groups.basis
+    few = "" if groups.shortfall is None else f" Not enough to pass: {groups.shortfall}."
     photos = photos_in_words(cast("int", basis["probe_photos"]))
     return (
-        f"Groups:   {groups.status}. Worst is {basis['attribute']} {basis['group']}: "
+        f"Groups: {groups.status}. Worst is {basis['attribute']} {basis['group']}: "
         f"{shown_rate(groups.rate)} of its impostor probes of {photos} "
         f"match at {basis['level']}; limit {100 * groups.limit:.3g} %. "
-        f"Groups by {basis['groups_from']}; lifted probes are not in it.{_shortfall(groups)}"
+        f"Groups by {basis['groups_from']}; lifted probes are not in it.{few}"
     )
 
 
@@ -132,6 +104,7 @@ def _plain_accuracy(accuracy: Judgement | None) -> str:
     else:
         share = f"none of {rejected.trials:,} genuine attempts is rejected"
     few = "" if accuracy.shortfall is None else f" Few were measured: {accuracy.shortfall}."
+    few += _not_acquired(accuracy)
     return f"Accuracy: {share}, with {enrolled} photos enrolled and {shown} shown.{few}"
 
 
@@ -173,14 +146,3 @@ def _not_acquired(accuracy: Judgement) -> str:
     if not (isinstance(failures, int) and isinstance(photos, int) and failures):
         return ""
     return f" Not counted: {failures:,} of {photos:,} photos without a usable face."
-
-
-def _shortfall(judgement: Judgement) -> str:
-    return "" if judgement.shortfall is None else f" Not enough to pass: {judgement.shortfall}."
-
-
-def _attacker(privacy: Judgement) -> str:
-    faces = privacy.basis["attacker_faces"]
-    if not isinstance(faces, int):
-        return "unlimited faces (on drawn people)"
-    return f"{faces:,} faces of other people" if faces else "nothing else"

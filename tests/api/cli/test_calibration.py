@@ -32,9 +32,9 @@ def test_so_few_people_show_nothing_of_any_dimension(asked: int | None) -> None:
     assert (point.axes, point.dim) in [(one.axes, one.m) for one in point.tried]
     assert point.privacy.status == "NOT SHOWN"
     (said, accuracy, _) = verdict_lines(Verdict(point.privacy))
-    assert said.startswith("Privacy:  NOT SHOWN. ")
-    assert "Not enough to pass: 15 people are too few to choose by" in said
-    assert accuracy == "Accuracy: not measured: nobody has two photos."
+    assert said.startswith("Privacy: not proven. ")
+    assert "This is not enough to prove it: 15 people are too few to choose by" in said
+    assert accuracy.startswith("Accuracy: not measured: nobody is labelled with two photos.")
 
 
 def judged(errors: int, trials: int, *, shortfall: str | None = None, **basis: int) -> Judgement:

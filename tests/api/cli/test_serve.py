@@ -75,7 +75,7 @@ def test_it_serves_prints_no_key_and_ends_by_sigterm(world, data, tmp_path):
     assert again.status == 0
     assert "API key" not in again.stderr
     assert not warnings(again)
-    assert "Privacy:  NOT SHOWN. The strongest thief, with" in again.stderr
+    assert "Privacy: not proven. " in again.stderr
 
 
 def test_a_master_key_beside_the_database_is_used_with_a_warning(world, data):
