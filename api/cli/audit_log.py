@@ -1,7 +1,6 @@
 """``veilface audit-log``: who did what, and whether the log is whole."""
 
 import json
-from collections.abc import Iterable, Iterator
 from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,7 +17,6 @@ from api.http.audit import operator
 from api.http.schemas import iso_time
 from api.service.opening import checked_store
 from api.settings import DEFAULT_TENANT, Settings
-from templates.store import TemplateStore
 from templates.store.audit_archive import Archive, verify_archive
 from templates.store.audit_chain import Anchor
 from templates.store.audit_log import Line
@@ -172,22 +170,12 @@ def show(
     with checked_store(settings) as store:
         name = tenant or (DEFAULT_TENANT if subject is not None else None)
         pseudonym = None if subject is None else store.signer.pseudonym(str(name), subject)
-        lines = store.audit_log.lines(after=after)
-        if name is not None:
-            lines = _lines_of(store, name, lines)
-        chosen = (line for line in lines if pseudonym in (None, line.pseudonym))
+        chosen = (
+            line
+            for line in store.audit_log.lines(after=after)
+            if name in (None, line.tenant) and pseudonym in (None, line.pseudonym)
+        )
         say_lines(json.dumps(_described(line)) for line in islice(chosen, limit))
-
-
-def _lines_of(store: TemplateStore, tenant: str, lines: Iterable[Line]) -> Iterator[Line]:
-    """Return the lines of a tenant, which may be erased; refuse one that never was."""
-    there = False
-    for line in lines:
-        if line.tenant == tenant:
-            there = True
-            yield line
-    if not there:
-        store.tenants.get(tenant)
 
 
 def _described(line: Line) -> dict[str, Any]:
