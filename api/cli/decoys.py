@@ -77,6 +77,9 @@ def build(
             "or a folder whose subfolders are named like the people."
         ),
     ] = None,
+    limit: Annotated[
+        int | None, typer.Option(min=1, help="Take this many photos of SOURCE, spread over it.")
+    ] = None,
     aligned: Aligned = False,
     flip: Flip = False,
     cache: Cache = None,
@@ -99,6 +102,8 @@ def build(
     if not chosen or (like and not sample):
         folders = ", ".join(map(str, photos if not chosen else like or []))
         raise CommandError(f"{exclude} leaves no photo of {folders}")
+    if limit is not None and limit < len(chosen):
+        chosen = [chosen[place * len(chosen) // limit] for place in range(limit)]
     attributes = _labels(photos, labels)
     embed = partial(extract, pack, aligned=aligned, settings=settings, cache=cache)
     extraction = embed(chosen)
