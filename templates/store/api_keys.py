@@ -56,15 +56,7 @@ class Right(StrEnum):
 
 @dataclass(frozen=True)
 class ApiKey:
-    """An API key without its secret.
-
-    Attributes
-    ----------
-    lowest_level
-        Security level below which it does not verify; None for any.
-    authentic
-        Whether the MAC of its row is good. Otherwise it is refused.
-    """
+    """An API key without its secret; `authentic` is whether the MAC of its row is good."""
 
     id: str
     prefix: str
@@ -111,11 +103,6 @@ class ApiKeys:
         """Make a key of an existing tenant; the audit log names it by its prefix.
 
         `lowest_level` is the name of a security level, of whatever contract is served.
-
-        Raises
-        ------
-        UnknownTenant, StoreError
-            For no right at all, an unknown one, or a label that is too long.
         """
         granted = _rights(rights)
         if len(label) > MAX_LABEL or not label.isprintable():

@@ -142,16 +142,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Problem:
-    """The first break of the chain.
-
-    Attributes
-    ----------
-    sequence
-        Number of the line at which it breaks.
-    what
-        ``"altered"``, ``"missing"``, ``"out of order"``, ``"head does not match"`` or
-        ``"anchor not in chain"``.
-    """
+    """The first break of the chain: the number of the line, and what is wrong there."""
 
     sequence: int
     what: str
@@ -159,17 +150,7 @@ class Problem:
 
 @dataclass(frozen=True)
 class Verification:
-    """What a walk over the whole chain showed.
-
-    Attributes
-    ----------
-    lines
-        Lines that were good.
-    head
-        The last of them.
-    problem
-        The first break; None where the chain is whole.
-    """
+    """What a walk over the whole chain showed: good lines, the last of them, the first break."""
 
     lines: int
     head: Anchor
@@ -182,15 +163,7 @@ class Verification:
 
 
 def token_digest(key_prefix: str, value: str) -> str:
-    """What the log keeps of a one-use token or challenge: 64 hexadecimal digits.
-
-    Parameters
-    ----------
-    key_prefix
-        Of the API key that asked for it.
-    value
-        Its random id.
-    """
+    """What the log keeps of a one-use token, by the prefix of its API key and its random id."""
     return hashlib.sha256(encode_parts("token", key_prefix, value)).hexdigest()
 
 
@@ -200,13 +173,7 @@ def template_digest(template_id: str) -> str:
 
 
 class AuditLog:
-    """The audit log of a deployment.
-
-    Parameters
-    ----------
-    database, secrets, clock
-        Where it is kept, what its chain is keyed with, and what time it is.
-    """
+    """The audit log of a deployment."""
 
     def __init__(self, database: Database, secrets: Secrets, clock: Clock) -> None:
         self._database = database
@@ -245,13 +212,7 @@ class AuditLog:
         self._database.write(lambda connection: self.append(connection, entry))
 
     def head(self) -> Anchor:
-        """Number and MAC of the last line; keep them elsewhere, to verify the log against.
-
-        Raises
-        ------
-        BrokenAuditLog
-            If the head row is missing or forged.
-        """
+        """Number and MAC of the last line; keep them elsewhere, to verify the log against."""
         return self._database.read(lambda connection: read_head(connection, self.key)).last
 
     def use_of(self, token: str) -> Line | None:
@@ -261,12 +222,7 @@ class AuditLog:
         return None if row is None else _line(row)
 
     def require_unused(self, token: str) -> None:
-        """Refuse early what a write would refuse; it decides nothing itself.
-
-        Raises
-        ------
-        Replayed
-        """
+        """Refuse early, with :class:`Replayed`, what a write would refuse; it decides nothing."""
         if self._database.read(lambda connection: is_used(connection, token)):
             raise Replayed
 
@@ -281,20 +237,8 @@ class AuditLog:
     ) -> tuple[list[Line], int | None]:
         """A tenant's lines, the latest first; not those of an erased tenant of the same name.
 
-        Parameters
-        ----------
-        tenant
-            Its name.
-        limit
-            Lines of the page.
-        before
-            Only lines with smaller numbers.
-        pseudonym
-            Only lines on this subject.
-
-        Returns
-        -------
-        The lines, and the number to go on before; None at the end.
+        Only lines with numbers smaller than `before`, and on one subject where a `pseudonym` is
+        given. Returns them, and the number to go on before; None at the end.
         """
         erased = sa.select(sa.func.coalesce(sa.func.max(AuditRow.sequence), 0)).where(
             AuditRow.tenant == tenant,
@@ -330,16 +274,9 @@ class AuditLog:
     ) -> Verification:
         """Walk over the whole chain, up to the first break, in a snapshot.
 
-        Parameters
-        ----------
-        anchor
-            An earlier head. Without one, an old state of the whole log is not told from a new one.
-        seen
-            Called with the columns of each good line.
-        progress
-            Called after each batch with the number of its lines.
-        batch
-            Lines read at once, and in memory.
+        `seen` is called with the columns of each good line, `progress` after each batch with the
+        number of its lines. Without an `anchor`, an earlier head, an old state of the whole log is
+        not told from a new one.
         """
         try:
             head = read_head(connection, key)

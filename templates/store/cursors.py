@@ -17,13 +17,7 @@ def close_cursor(keyring: MasterKeyring, place: str, *, purpose: str, tenant: st
 
 
 def open_cursor(keyring: MasterKeyring, cursor: str, *, purpose: str, tenant: str) -> str:
-    """Return the place that :func:`close_cursor` sealed.
-
-    Raises
-    ------
-    InvalidIdentifier
-        If the cursor was not given for this list of this tenant.
-    """
+    """Return the place that :func:`close_cursor` sealed for this list of this tenant."""
     if len(cursor) > MAX_CURSOR:
         raise InvalidIdentifier("this cursor is too long to be one of ours")
     try:

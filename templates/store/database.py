@@ -62,17 +62,12 @@ class Database:
     Parameters
     ----------
     url
-        ``sqlite:///path`` or ``postgresql://user@host/name``. The path of SQLite is a file on a
-        local disk; it is created with mode 0600.
+        ``sqlite:///path``, a file on a local disk, made with mode 0600, or
+        ``postgresql://user@host/name``.
     pool_size, max_overflow
         Connections kept, and further ones under load, in each process.
     timeout
         Seconds to wait for a connection, or for another write of any process.
-
-    Raises
-    ------
-    StoreError
-        If the URL names neither database.
     """
 
     def __init__(
@@ -93,10 +88,8 @@ class Database:
     def read(self, work: Callable[[Connection], T]) -> T:
         """Run `work` on a connection; what it sees is committed.
 
-        Raises
-        ------
-        StoreUnavailable, StoreError
-            In our own words, without a statement, its parameters or a row.
+        An error is a :class:`StoreError` in our own words, without a statement, its parameters or
+        a row.
         """
         return self._read(self._readers, work)
 
@@ -114,22 +107,11 @@ class Database:
             return work(connection)
 
     def write(self, work: Callable[[Connection], T], *, wait: float | None = None) -> T:
-        """Run `work` in one transaction, while no other write runs, and commit it.
+        """Run `work`, a short one, in one transaction, while no other write runs, and commit it.
 
-        Parameters
-        ----------
-        work
-            For a short time: every other write waits for it.
-        wait
-            Seconds to wait for other writes; the timeout by default, and 0 for as long as it takes
-            (on SQLite, and for the threads of this process, the timeout).
-
-        Raises
-        ------
-        StoreBusy
-            If other writes take longer.
-        StoreUnavailable, StoreError
-            As of :meth:`read`. Nothing was written.
+        `wait` is how many seconds to wait for other writes, the timeout by default, and 0 for as
+        long as it takes (on SQLite, and for the threads of this process, the timeout). After
+        :class:`StoreBusy`, as after any error, nothing was written.
         """
         wait = self._timeout if wait is None else wait
         patience = wait or self._timeout

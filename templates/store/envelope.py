@@ -70,14 +70,7 @@ def close_envelope(wire: bytes, owner: Owner, keyring: MasterKeyring) -> Envelop
 
 
 def open_envelope(envelope: Envelope, owner: Owner, keyring: MasterKeyring) -> bytes:
-    """Decrypt a template.
-
-    Raises
-    ------
-    SealError
-        If key or ciphertext was altered, or belongs to another owner or another enrollment, or if
-        the master key is missing.
-    """
+    """Decrypt a template; :class:`SealError` if it was altered or moved, or a key is missing."""
     data_key = keyring.open(
         envelope.wrapped_key,
         purpose=DATA_KEY_PURPOSE,

@@ -47,12 +47,8 @@ def checked_subject_id(text: str) -> str:
     """Return a subject id in NFC: two spellings that look alike to everybody are one subject.
 
     Letters that only look alike, such as Latin and Cyrillic a, stay apart, and so do capitals.
-
-    Raises
-    ------
-    InvalidIdentifier
-        With the rule. Spaces, controls and invisible characters are refused, which nobody can tell
-        from their absence.
+    Spaces, controls and invisible characters, which nobody can tell from their absence, are an
+    :class:`InvalidIdentifier`.
     """
     # A client or proxy may rewrite "." and ".." as path steps, and so name another resource.
     if text in (".", ".."):

@@ -98,14 +98,9 @@ class Superseded(StoreBusy):
 
 
 class LockedOut(StoreError):
-    """Too many failed attempts on the subject.
+    """Too many failed attempts on the subject; without `retry_after_s` an operator must reset it.
 
-    Attributes
-    ----------
-    retry_after_s
-        Seconds until the lock ends; None where an operator must end it.
-    recorded
-        Whether the audit log has a line of it.
+    `recorded` is whether the audit log has a line of it.
     """
 
     retry_after_s: float | None = None
@@ -124,10 +119,7 @@ class LockedOut(StoreError):
 class Replayed(StoreError):
     """A token, or an answer to a challenge, that was used before or comes too late.
 
-    Attributes
-    ----------
-    recorded
-        Whether the audit log has a line of it, or gets none.
+    `recorded` is whether the audit log has a line of it, or gets none.
     """
 
     recorded = False

@@ -97,13 +97,7 @@ def owner_of(row: Any) -> Owner:
 
 
 def opened_template(row: Any, keyring: MasterKeyring) -> SubjectTemplate:
-    """Decrypt the template of a row.
-
-    Raises
-    ------
-    SealError
-        If the row was altered or moved, or its master key is missing.
-    """
+    """Decrypt the template of a row; :class:`SealError` as of :func:`open_envelope`."""
     wire = open_envelope(Envelope(row.wrapped_key, row.ciphertext), owner_of(row), keyring)
     return SubjectTemplate(record=read_record(row), wire=wire)
 

@@ -212,13 +212,7 @@ class Subjects:
         context.database.write(work)
 
     def get(self, tenant: str, subject_id: str) -> SubjectTemplate | None:
-        """Return a subject with its decrypted template, or None.
-
-        Raises
-        ------
-        SealError
-            If the row was altered or moved, or its master key is missing.
-        """
+        """Return a subject with its decrypted template, or None."""
         row = self._row(TEMPLATE_COLUMNS, tenant, subject_id)
         return None if row is None else opened_template(row, self._context.keyring)
 
@@ -244,20 +238,12 @@ class Subjects:
 
         Parameters
         ----------
-        tenant
-            Whose subjects.
         limit
             1 to 1000.
         cursor
             `next_cursor` of the page before; it is sealed, so it shows no subject id.
         prefix
             Only subjects whose ids begin so.
-
-        Raises
-        ------
-        InvalidIdentifier
-            For a limit out of range, a cursor that this store did not give for this tenant, or a
-            prefix with which no subject id begins.
         """
         if not 1 <= limit <= MAX_PAGE:
             raise InvalidIdentifier(f"the limit of a page is 1 to {MAX_PAGE}")

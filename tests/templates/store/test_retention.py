@@ -76,31 +76,6 @@ def test_who_is_due(
     assert five.retention.erase_expired(keep) == 0
 
 
-def test_the_limit_itself_is_not_over_it(store: TemplateStore, clock: Clock) -> None:
-    put(store, "ada", b"wire")
-    clock.pass_by(days=10)
-    assert (
-        store.retention.due(Retention(10 * DAY))
-        == store.retention.due(Retention(None, 10 * DAY))
-        == 0
-    )
-    clock.pass_by(microseconds=1)
-    assert (
-        store.retention.due(Retention(10 * DAY))
-        == store.retention.due(Retention(None, 10 * DAY))
-        == 1
-    )
-
-
-def test_age_counts_from_the_latest_enrollment(store: TemplateStore, clock: Clock) -> None:
-    put(store, "ada", b"wire")
-    clock.pass_by(days=90)
-    put(store, "ada", b"wire")
-    clock.pass_by(days=10)
-    use(store, "ada")
-    assert store.retention.due(Retention(50 * DAY, 5 * DAY)) == 0
-
-
 def test_it_is_the_ordinary_erasure(store: TemplateStore, clock: Clock) -> None:
     put(store, "ada", b"wire")
     put(store, "ada", b"wire", tenant="other")
@@ -124,15 +99,6 @@ def test_a_senseless_retention_is_refused(value: timedelta) -> None:
     for arguments in ((value, None), (None, value), (DAY, value)):
         with pytest.raises(StoreError, match="36500 days"):
             Retention(*arguments)
-
-
-def test_many_of_one_moment_are_listed_in_steps(store: TemplateStore, clock: Clock) -> None:
-    for number in range(11):
-        put(store, f"s{number}", b"wire")
-    clock.pass_by(days=10)
-    put(store, "young", b"wire")
-    assert store.retention.erase_expired(Retention(5 * DAY), batch=3) == 11
-    assert names(store) == ["young"]
 
 
 def after_listing(monkeypatch: pytest.MonkeyPatch, action: Callable[[], object]) -> None:

@@ -1,11 +1,7 @@
-from concurrent.futures import ThreadPoolExecutor, wait
-from pathlib import Path
-
 import pytest
 import sqlalchemy as sa
 
 from templates.errors import StoreError
-from templates.keys.sealing import MasterKeyring
 from templates.store import (
     By,
     InvalidIdentifier,
@@ -25,8 +21,7 @@ from templates.store.schema import (
     TemplateRow,
     TenantRow,
 )
-from tests.patience import PATIENCE_S
-from tests.templates.store.conftest import Clock, SlowSealing, count, put
+from tests.templates.store.conftest import Clock, count, put
 from tests.templates.store.test_attempts import attempt
 
 OPERATOR = By("operator:kim", "request-1")
@@ -65,13 +60,6 @@ def counted(receipt: Receipt) -> dict[str, int]:
 
 def outcomes(store: TemplateStore) -> list[str]:
     return [line.outcome for line in store.audit_log.lines() if line.action == "tenant-erase"]
-
-
-def nothing_is_left(store: TemplateStore, *, tenants: int) -> bool:
-    """Whether the tables hold what empty tenants hold: their row and a rotation key."""
-    held = {table: count(store, table) for table in OF_A_TENANT}
-    expected = dict.fromkeys(OF_A_TENANT, 0) | {TenantRow: tenants, RotationKeyRow: tenants}
-    return held == expected
 
 
 def test_everything_of_the_tenant_goes_and_nothing_of_another(
@@ -154,25 +142,6 @@ def test_a_forged_receipt_sets_no_epoch(store: TemplateStore) -> None:
     store.database.write(lambda each: each.execute(sa.update(ReceiptRow).values(body=forged)))
     with pytest.raises(StoreError, match="signature"):
         store.tenants.create("default")
-
-
-def test_an_enrollment_under_way_goes_with_the_tenant(
-    store: TemplateStore, database_url: str, key_file: Path, slow_sealing: SlowSealing
-) -> None:
-    """It found the tenant, and has not committed: no query can see it yet."""
-    service = TemplateStore(database_url, MasterKeyring.load(key_file))
-    with ThreadPoolExecutor(2) as threads:
-        writing = threads.submit(put, service, "ada", b"wire")
-        assert slow_sealing.sealed.wait(PATIENCE_S)
-        erasing = threads.submit(store.erasures.erase_tenant, "default")
-        early = wait([erasing], timeout=0.5).done
-        slow_sealing.go_on.set()
-        assert writing.result().created
-        erasure = erasing.result()
-    assert not early
-    assert counted(erasure.receipt)["subjects"] == 1
-    assert nothing_is_left(store, tenants=1)
-    service.close()
 
 
 def test_every_table_of_a_tenant_is_known() -> None:
