@@ -46,18 +46,8 @@ class WireTemplate:
 def encode(subspace: SubspaceBatch, *, contract_id: str, dtype: WireDtype = "float16") -> bytes:
     """Return the bytes of a template; equal templates give equal bytes.
 
-    Parameters
-    ----------
-    subspace : SubspaceBatch
-    contract_id : str
-        64 lower-case hexadecimal digits.
-    dtype : {"float16", "float32"}
-        Float16 halves the size and moves distances by about 10⁻⁴.
-
-    Raises
-    ------
-    InvalidTemplate
-        The subspace fails its own check, or the contract id is malformed.
+    Float16 halves the size and moves distances by about 10⁻⁴. InvalidTemplate where the subspace
+    fails its own check, or the contract id has not 64 lower-case hexadecimal digits.
     """
     if dtype not in _CODES:
         raise InvalidTemplate("a template is written in float16 or float32")
@@ -75,23 +65,11 @@ def encoded_size(n: int, m: int, dtype: WireDtype = "float16") -> int:
 
 
 def decode(data: bytes | bytearray | memoryview) -> WireTemplate:
-    """Read the bytes of a template from anybody.
+    """Read the bytes of a template from anybody; of more than ``MAX_BYTES`` nothing is read.
 
-    Parameters
-    ----------
-    data : bytes-like
-        At most ``MAX_BYTES``: of more, nothing is read.
-
-    Returns
-    -------
-    WireTemplate
-        The basis orthonormalised again and the foot point made orthogonal to it in float64,
-        which removes the rounding of the wire.
-
-    Raises
-    ------
-    InvalidTemplate
-        Anything is not exactly as in docs/formats.md. The message gives the reason.
+    The basis is orthonormalised again and the foot point made orthogonal to it in float64, which
+    removes the rounding of the wire. InvalidTemplate, with the reason, for anything that is not
+    exactly as in docs/formats.md.
     """
     contract_id, dtype, foot, basis = _numbers(data)
     # Before the cast, which NumPy warns of for a signalling NaN.
@@ -107,11 +85,6 @@ def decode_as_stored(data: bytes | bytearray | memoryview) -> WireTemplate:
     A seventh of the work of :func:`decode`. The numbers stay as they were rounded, which
     ``paired_distances`` allows for with ``as_stored``, and are not looked at: the seal vouches
     for them.
-
-    Raises
-    ------
-    InvalidTemplate
-        The container is not exactly as in docs/formats.md.
     """
     contract_id, dtype, foot, basis = _numbers(data)
     subspace = SubspaceBatch(foot.astype(np.float32), basis.astype(np.float32))

@@ -64,21 +64,11 @@ def read_at_most(file: BinaryIO, most: int) -> bytes:
 
 
 def read_private(path: Path, most: int, *, source: str, remedy: str, allowed: int = 0) -> bytes:
-    """Read a small file that nobody else may read.
+    """Read a small file, of `most` bytes, that nobody else may read.
 
-    Parameters
-    ----------
-    most
-        Bytes that it may have.
-    source, remedy
-        What messages call the file, and what to do where others may read it.
-    allowed
-        Bits of the mode for group and others that are no fault.
-
-    Raises
-    ------
-    SealError
-        If the file cannot be read, is no regular file, is too large, or others may read it.
+    `source` and `remedy` are what messages call the file, and what to do where others may read it;
+    `allowed` are bits of the mode for group and others that are no fault. A :class:`SealError` says
+    what is wrong.
     """
     try:
         # Not blocking: a named pipe in the place of the file would hold the reader for ever.

@@ -101,12 +101,7 @@ class Keystream:
         return out
 
     def uniform(self, shape: Shape, low: float = 0.0, high: float = 1.0) -> NDArray[np.float64]:
-        """Sample U([low, high)) with 53 random bits each.
-
-        Returns
-        -------
-        ndarray of float64, of ``shape``
-        """
+        """Sample U([low, high)) with 53 random bits each, as float64 of ``shape``."""
         out = np.empty(shape, dtype=np.float64)
         flat = out.reshape(-1)
         words = np.empty(min(_TILE, flat.size), dtype=np.uint64)
@@ -120,14 +115,10 @@ class Keystream:
         return out
 
     def normal(self, shape: Shape) -> NDArray[np.float64]:
-        """Sample N(0, 1) by the inverse distribution function.
+        """Sample N(0, 1) by the inverse distribution function, as float64 of ``shape``.
 
         The uniforms are odd multiples of 2⁻⁵³, so 0 and 1 (infinite normals) never occur, and a
         sample costs one word of the stream whatever its value.
-
-        Returns
-        -------
-        ndarray of float64, of ``shape``
         """
         out = np.empty(shape, dtype=np.float64)
         flat = out.reshape(-1)
@@ -142,12 +133,7 @@ class Keystream:
         return out
 
     def integers(self, bound: int, size: int) -> NDArray[np.int64]:
-        """Sample ``size`` integers of 0 … ``bound`` − 1, exactly uniform (by rejection).
-
-        Returns
-        -------
-        ndarray of int64, shape (size,)
-        """
+        """Sample ``size`` integers of 0 … ``bound`` − 1, exactly uniform, by rejection."""
         if not 1 <= bound <= 2**62:
             raise ValueError(f"the bound must lie between 1 and 2**62, not {bound}")
         # Words of the last, incomplete run of `bound` values would favour the small integers.
@@ -161,18 +147,10 @@ class Keystream:
         return (words % np.uint64(bound)).astype(np.int64)
 
     def choose(self, population: int, rows: int, k: int) -> NDArray[np.int64]:
-        """Sample ``k`` different integers of 0 … ``population`` − 1 in every row.
+        """Sample ``k`` different integers of 0 … ``population`` − 1 in every row, int64 (rows, k).
 
-        Every ordered selection has the same probability. Rows are independent.
-
-        Returns
-        -------
-        ndarray of int64, shape (rows, k)
-
-        Notes
-        -----
-        Floyd's algorithm (Bentley & Floyd, CACM 1987), a column at a time for all rows, then
-        Fisher–Yates for the order: O(rows · k²) whatever the population.
+        Every ordered selection has the same probability. By Floyd's algorithm (Bentley & Floyd,
+        CACM 1987), a column at a time for all rows, then Fisher–Yates for the order.
         """
         if not 0 <= k <= population:
             raise ValueError(f"cannot choose {k} different integers out of {population}")

@@ -98,12 +98,7 @@ def _cosines_back(rows: Array64) -> Array64:
 class TenantRotation:
     """Gives each template that a tenant has in one epoch its rotation.
 
-    Parameters
-    ----------
-    key : bytes
-        The 32 secret bytes of the tenant and epoch.
-    n : int
-        Descriptor dimension.
+    `key` are the 32 secret bytes of tenant and epoch, `n` the dimension.
     """
 
     def __init__(self, key: bytes, n: int) -> None:
@@ -118,15 +113,8 @@ class TenantRotation:
         return f"TenantRotation(n={self.n})"
 
     def of(self, template_id: str) -> SignedCosineRotation:
-        """Return the rotation of one template. Equal on every machine to rounding.
+        """Return the rotation of one template, whose id is random. Equal everywhere to rounding.
 
-        Parameters
-        ----------
-        template_id
-            Random, and another one for each enrollment: two templates never share a rotation.
-
-        Notes
-        -----
         HKDF-SHA-256 turns the key, n and the id into the bits of all signs. The derived bits are
         the whole secret of this rotation: a person who finds out the rotation of their own template
         learns nothing about another's.
@@ -136,20 +124,10 @@ class TenantRotation:
 
 
 def holder_rotation(key: HolderKey, salt: str, n: int) -> SignedCosineRotation:
-    """Return the rotation of one enrollment under its holder's key.
+    """Return the rotation of one enrollment under its holder's key, of n dimensions.
 
-    Parameters
-    ----------
-    salt
-        Random, and another one for each enrollment. It stays where the template gets another id:
-        the holder's key is not there when a template is imported.
-    n
-        Descriptor dimension.
-
-    Raises
-    ------
-    ValueError
-        Where the key has another length.
+    The salt is random, and another one for each enrollment. It stays where the template gets
+    another id: the holder's key is not there when a template is imported.
     """
     if len(key) != KEY_BYTES:
         raise ValueError(f"a holder key has {KEY_BYTES} bytes, not {len(key)}")

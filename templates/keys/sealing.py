@@ -55,12 +55,9 @@ class Sealer(Protocol):
 
 
 def encode_parts(*parts: str | bytes | int) -> bytes:
-    """Encode parts as associated data, injectively: count, then type, length and bytes of each.
+    """Encode parts injectively: their count, then type, length and bytes of each.
 
-    Parameters
-    ----------
-    *parts
-        Text is taken as UTF-8, a whole number in decimal. The type is part of the encoding.
+    Text is taken as UTF-8, a whole number in decimal.
     """
     encoded = [len(parts).to_bytes(4, "big")]
     for part in parts:
@@ -88,17 +85,9 @@ class MasterKeyring:
     names a key that is not in memory. So a running service picks up a rotation without a restart.
     The environment of a process never changes.
 
-    Parameters
-    ----------
-    keys
-        32 random bytes each, the current one first.
-    source
-        What to call the place they came from in error texts.
-
-    Raises
-    ------
-    SealError
-        For no key, a repeated key, a key of another length, or one that is visibly not random.
+    `keys` have 32 random bytes each, the current one first; `source` is what error texts call the
+    place they came from. A keyring without a key, or with one of another length or a repeated one,
+    is a :class:`SealError`.
     """
 
     def __init__(self, keys: Sequence[bytes], *, source: str = "the master keyring") -> None:
@@ -113,10 +102,7 @@ class MasterKeyring:
     def load(cls, path: str | Path) -> Self:
         """Read a key file: one base64 key of 32 bytes on a line, the current one first.
 
-        Raises
-        ------
-        SealError
-            If the file is absent, readable by group or others, or holds anything else.
+        :class:`SealError` if it is absent, readable by group or others, or holds anything else.
         """
         path = Path(path)
         keys, stamp = read_key_file(path)
@@ -140,11 +126,6 @@ class MasterKeyring:
         """Read the keys from an environment variable, in the form of a key file.
 
         A space or a comma may stand in the place of a line break.
-
-        Raises
-        ------
-        SealError
-            If the variable is not set, or holds anything but good keys.
         """
         source = f"the environment variable {name}"
         text = os.environ.get(name)
@@ -212,16 +193,9 @@ class MasterKeyring:
     def seal(
         self, plaintext: bytes, *, purpose: str, bound_to: Sequence[str | bytes | int]
     ) -> bytes:
-        """Encrypt under the current key.
+        """Encrypt less than 2 GiB under the current key, derived for a purpose.
 
-        Parameters
-        ----------
-        plaintext
-            Less than 2 GiB.
-        purpose
-            Label of the derived key, for instance ``"subject-key"``.
-        bound_to
-            What the blob belongs to; it opens only with the same parts.
+        The blob opens only with the same purpose, and the parts that it is bound to.
         """
         self._follow_file()
         keys = self._keys
@@ -233,10 +207,7 @@ class MasterKeyring:
     def open(self, sealed: bytes, *, purpose: str, bound_to: Sequence[str | bytes | int]) -> bytes:
         """Decrypt what :meth:`seal` made with the same purpose and parts.
 
-        Raises
-        ------
-        SealError
-            If the blob names an unknown key, belongs to something else, or was altered.
+        :class:`SealError` if it names an unknown key, belongs to something else, or was altered.
         """
         key_id = sealed_key_id(sealed)
         raw_id = bytes.fromhex(key_id)

@@ -24,19 +24,8 @@ def unit_descriptors(descriptors: ArrayLike) -> NDArray[np.float64]:
     One that is not a unit vector is refused, since distances assume the unit sphere: the zero
     vector is at Euclidean distance ‖p‖ from every template (docs/method.md §4.7).
 
-    Parameters
-    ----------
-    descriptors : array_like of floats, shape (N, n)
-
-    Returns
-    -------
-    ndarray of float64, shape (N, n)
-        Unit rows.
-
-    Raises
-    ------
-    InvalidEmbedding
-        The shape is wrong, a number is not finite, or a norm differs from 1 by more than 1e-3.
+    Returns float64 (N, n). InvalidEmbedding for another shape, a number that is not finite, or a
+    norm that differs from 1 by more than 1e-3.
     """
     rows = np.asarray(descriptors)
     if rows.ndim != 2 or rows.shape[1] < 2 or not np.issubdtype(rows.dtype, np.floating):
@@ -58,24 +47,9 @@ def unit_descriptors(descriptors: ArrayLike) -> NDArray[np.float64]:
 
 
 def unit_rows(embeddings: NDArray[np.generic], *, n: int, most: int) -> NDArray[np.float32]:
-    """:func:`unit_descriptors` for what a client sends.
+    """:func:`unit_descriptors` for what a client sends: at most `most` rows of `n` numbers, or one.
 
-    Parameters
-    ----------
-    embeddings : (n,) or (k, n) array of numbers
-    n
-        The contract's descriptor dimension.
-    most
-        Largest k.
-
-    Returns
-    -------
-    (k, n) float32, C-contiguous
-
-    Raises
-    ------
-    InvalidEmbedding
-        As :func:`unit_descriptors`, or for another number of rows or columns.
+    Returns float32 (k, n), C-contiguous.
     """
     array = np.asarray(embeddings)
     if array.dtype.kind not in "fiu":

@@ -46,26 +46,11 @@ def is_finite(numbers: NDArray[np.floating]) -> bool:
 
 
 def span_basis(directions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Orthonormal bases of the spans of a stack of directions.
+    """Orthonormal bases (N, m, n) of the spans of a stack of directions, both float64.
 
-    Parameters
-    ----------
-    directions : ndarray of float64, shape (N, m, n)
-
-    Returns
-    -------
-    ndarray of float64, shape (N, m, n)
-        Orthonormal rows.
-
-    Raises
-    ------
-    LiftingError
-        A direction lies in the span of the others, or is zero.
-
-    Notes
-    -----
-    Cholesky factorisation of the Gram matrix, twice (CholeskyQR2, Yamamoto et al. 2015): as
-    accurate as Householder's up to condition number 10⁷, and eight times as fast in batches.
+    By Cholesky factorisation of the Gram matrix, twice (CholeskyQR2, Yamamoto et al. 2015): as
+    accurate as Householder's up to condition number 10⁷, and eight times as fast in batches. A
+    LiftingError where a direction is zero or lies in the span of the others.
     """
     lengths = np.linalg.norm(directions, axis=2, keepdims=True)
     if not lengths.all():
@@ -149,14 +134,10 @@ class SubspaceBatch:
         return np.asarray(np.linalg.norm(gap, axis=-1) <= tol)
 
     def validate(self, tol: float = FLOAT32_TOLERANCE) -> None:
-        """Check that the numbers are those of templates.
+        """Check that the numbers are those of templates; InvalidTemplate names what is wrong.
 
-        Raises
-        ------
-        InvalidTemplate
-            A number is not finite, a basis is not orthonormal or a foot point not orthogonal
-            to it within ``tol``, or a foot point lies outside the unit ball, where no set
-            through a unit embedding has it.
+        All are finite, bases orthonormal and foot points orthogonal to them within ``tol``, and no
+        foot point lies outside the unit ball, where no set through a unit embedding has it.
         """
         if not self.is_finite:
             raise InvalidTemplate("a template holds a number that is not finite")
@@ -170,11 +151,7 @@ class SubspaceBatch:
 
     @cached_property
     def is_finite(self) -> bool:
-        """Whether no number is infinite or NaN; looked at once, as a batch does not change.
-
-        A large batch that many probes are compared with, such as a cohort, would otherwise be read
-        once more with each of them.
-        """
+        """Whether no number is infinite or NaN; looked at once, as a batch does not change."""
         return is_finite(self.feet) and is_finite(self.bases)
 
     @classmethod

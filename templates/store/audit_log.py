@@ -58,15 +58,7 @@ def _check_text(text: str | None, what: str) -> None:
 
 @dataclass(frozen=True)
 class By:
-    """Who does something.
-
-    Attributes
-    ----------
-    actor
-        ``"key:<prefix>"``, ``"operator:<user>"``, ``"retention"`` or ``"program"``.
-    request_id
-        Of the request, where it is one.
-    """
+    """Who does something, ``"key:<prefix>"`` or ``"operator:<user>"``, and the request's id."""
 
     actor: str = "program"
     request_id: str | None = None
@@ -84,22 +76,10 @@ PROGRAM = By()
 class Entry:
     """What a line tells, before it has its place in the log.
 
-    Attributes
-    ----------
-    action, outcome
-        Short words, such as ``"erase"`` and ``"erased"``.
-    by
-        Who did it.
-    tenant
-        Name of the tenant it was done in.
-    pseudonym
-        Of the subject it was done to (:meth:`ReceiptSigner.pseudonym`). Never a subject id:
-        anything but 64 hexadecimal digits is refused.
-    detail
-        What else it was done with: the level of a verification, the prefix of a key, the digest
-        of an enrollment's template id (:func:`template_digest`).
-    token
-        Of the one-use token that it used up (:func:`token_digest`).
+    `action` and `outcome` are short words, such as ``"erase"`` and ``"erased"``. The subject it was
+    done to is named by its pseudonym (:meth:`ReceiptSigner.pseudonym`), never by its id. `detail`
+    is what else it was done with: the level of a verification, the prefix of a key, the digest of a
+    template's id; `token` the digest of the one-use token that it used up.
     """
 
     action: str

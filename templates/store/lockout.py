@@ -32,19 +32,9 @@ class AttemptsStatus:
 class LockoutPolicy:
     """When a subject is locked, and for how long.
 
-    Attributes
-    ----------
-    after
-        Consecutive failures that lock; 0 for no lockout at all.
-    first_s, longest_s
-        Seconds of the first lock, which doubles with each further failure, and of the longest.
-    disable_at
-        Consecutive failures after which the subject stays locked until an operator resets it.
-
-    Notes
-    -----
-    The k-th consecutive failure locks for min(first_s * 2**(k - after), longest_s). While a lock
-    holds, nothing is decided and nothing is counted.
+    The k-th consecutive failure locks for min(first_s * 2**(k - after), longest_s) seconds; `after`
+    0 is no lockout at all. After `disable_at` failures the subject stays locked until an operator
+    resets it. While a lock holds, nothing is decided and nothing is counted.
     """
 
     after: int = 5

@@ -116,8 +116,6 @@ class Subjects:
 
         Parameters
         ----------
-        tenant, subject_id
-            Whose it is.
         wire
             The template's wire bytes, 4 MiB at most.
         contract_id, n, m, dtype, source, photos
@@ -131,13 +129,8 @@ class Subjects:
             Another one is refused: its key is, or will be, dropped.
         precondition
             What may be replaced; whatever there is by default.
-        action
-            What the line of the audit log calls it.
         token
-            Digest of the one-use token that allows the enrollment, which uses it up; None where
-            none is needed.
-        by
-            Who enrolls, for the audit log.
+            Digest of the one-use token that allows the enrollment, which uses it up.
 
         Raises
         ------
