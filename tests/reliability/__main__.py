@@ -9,13 +9,12 @@ from pathlib import Path
 
 from tests.reliability.cluster import Cluster
 from tests.reliability.evidence import Report
-from tests.reliability.full_disk import full_disk_run
 from tests.reliability.kill import kill_run
 from tests.reliability.outage import outage_run
-from tests.reliability.races import CLIENTS, lockout_run, race_run
+from tests.reliability.races import CLIENTS, race_run
 
 OPERATIONS_A_KILL = 10
-SCENARIOS = ("kill", "races", "lockout", "outage", "full-disk")
+SCENARIOS = ("kill", "races", "outage")
 
 
 def run(arguments: argparse.Namespace, folder: Path, resources: ExitStack) -> Report:
@@ -24,14 +23,10 @@ def run(arguments: argparse.Namespace, folder: Path, resources: ExitStack) -> Re
     if arguments.scenario == "outage":
         cluster, modes = resources.enter_context(Cluster()), ("fast", "immediate") * 5
         return outage_run(cluster, folder, modes=modes, down_s=5.0, seed=seed)
-    if arguments.scenario == "full-disk":
-        return full_disk_run(folder, rounds=5, short_s=4.0, seed=seed)
     postgres = arguments.database == "postgres"
     url = resources.enter_context(Cluster()).url if postgres else None
     if arguments.scenario == "races":
         return race_run(url, folder, each=max(1, operations // CLIENTS), seed=seed)
-    if arguments.scenario == "lockout":
-        return lockout_run(url, folder, subjects=20)
     return kill_run(
         url,
         folder,

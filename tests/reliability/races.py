@@ -5,7 +5,6 @@ import threading
 from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from pathlib import Path
 
 import psutil
@@ -20,7 +19,6 @@ from tests.reliability.operations import Clients, Operation, People
 
 CLIENTS = 32
 SUBJECTS = 5
-LOCKOUT_AFTER = 5
 KINDS = ("enroll", "enroll", "verify", "verify", "verify", "erase", "describe")
 
 
@@ -49,52 +47,6 @@ def race_run(database_url: str | None, folder: Path, *, each: int, seed: int) ->
         for subject in subjects
     )
     return report
-
-
-def lockout_run(database_url: str | None, folder: Path, *, subjects: int) -> Report:
-    """Send wrong probes to one subject after the other, many at once; half are not enrolled."""
-    report = Report()
-    deployment = deploy(
-        folder,
-        database_url=database_url,
-        port=free_port(),
-        **{**QUIET, "lockout_after": LOCKOUT_AFTER, "compute_slots": 4},
-    )
-    people = People(deployment, [1, 2])
-    with Server(deployment, folder) as service:
-        clients = Clients(service, people)
-        with _BothWork(service, report.violations):
-            for number in range(subjects):
-                subject = f"subject-{number}"
-                if number % 2 == 0 and not clients.enroll(subject, 1).answered_well:
-                    report.violations.append(f"{subject} was not enrolled")
-                _at_once(partial(_fail, clients, subject), CLIENTS)
-                # The enrolled person is locked out too.
-                clients.verify(subject, 1)
-                _count_answers(clients.history, subject, report)
-    return report
-
-
-def _fail(clients: Clients, subject: str, _: int) -> Operation:
-    return clients.verify(subject, 2)
-
-
-def _count_answers(history: Sequence[Operation], subject: str, report: Report) -> None:
-    asked = [each for each in history if each.kind == "verify" and each.subject == subject]
-    answers = Counter(
-        (each.outcome, "" if each.code else str(each.answer["decision"])) for each in asked
-    )
-    report.add("rejections", answers[200, "reject"])
-    report.add("locked_out", answers[423, ""])
-    expected = {
-        (200, "reject"): LOCKOUT_AFTER,
-        (423, ""): CLIENTS + 1 - LOCKOUT_AFTER,
-    }
-    if answers != expected:
-        report.violations.append(f"{subject}: {dict(answers)}")
-    for each in asked:
-        if each.outcome == 423 and not 3000 < int(each.retry_after or 0) <= 3600:
-            report.violations.append(f"{subject}: Retry-After {each.retry_after}")
 
 
 def _something(clients: Clients, subjects: dict[str, list[int]], draw: random.Random) -> None:

@@ -4,14 +4,12 @@ from pathlib import Path
 
 import pytest
 
-from tests.reliability.races import lockout_run, race_run
+from tests.reliability.races import race_run
 
 pytestmark = pytest.mark.long
 
-both = pytest.mark.parametrize("database_url", ["sqlite", "postgres"], indirect=True)
 
-
-@both
+@pytest.mark.parametrize("database_url", ["sqlite", "postgres"], indirect=True)
 def test_answers_have_a_serial_order(database_url: str, tmp_path: Path) -> None:
     report = race_run(database_url, tmp_path, each=8, seed=6)
     assert report.violations == []
@@ -19,10 +17,3 @@ def test_answers_have_a_serial_order(database_url: str, tmp_path: Path) -> None:
     assert sum(operations.values()) >= 32 * 8
     assert min(operations[kind] for kind in ("enroll", "erase", "verify", "describe")) >= 20
     assert report.figures["most_at_once_on_one_subject"] >= 4
-
-
-@both
-def test_two_workers_count_one_lockout(database_url: str, tmp_path: Path) -> None:
-    report = lockout_run(database_url, tmp_path, subjects=4)
-    assert report.violations == []
-    assert report.figures == {"rejections": 4 * 5, "locked_out": 4 * 28}

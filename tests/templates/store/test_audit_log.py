@@ -4,7 +4,6 @@ import hashlib
 import hmac
 import json
 import os
-import threading
 from collections.abc import Callable, Iterator
 from itertools import chain
 from pathlib import Path
@@ -510,29 +509,3 @@ def test_processes_append_to_one_chain(store: TemplateStore) -> None:
         assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
     assert [line.sequence for line in store.audit_log.lines()] == list(range(1, 101))
     assert store.audit_log.verify().intact
-
-
-def test_verifying_beside_writers_ends_and_is_clean(
-    filled: TemplateStore, database_url: str, key_file: Path
-) -> None:
-    errors: list[BaseException] = []
-    reader = TemplateStore(database_url, MasterKeyring.load(key_file))
-
-    def write() -> None:
-        try:
-            for _ in range(40):
-                filled.audit_log.record(entry(1))
-        except BaseException as error:
-            errors.append(error)
-
-    verifications = []
-    threads = [threading.Thread(target=write) for _ in range(3)]
-    for thread in threads:
-        thread.start()
-    while any(thread.is_alive() for thread in threads):
-        verifications.append(reader.audit_log.verify(batch=5))
-    verifications.append(reader.audit_log.verify(batch=5))
-    assert errors == []
-    assert {each.problem for each in verifications} == {None}
-    assert verifications[-1].lines == LINES + 3 * 40
-    reader.close()
