@@ -104,20 +104,6 @@ def test_subspace_pairs_agree_with_brute_force(relation: str, metric: str, name:
             assert seen[0, 0] == pytest.approx(expected, rel=1e-4 if expected > 0.1 else 1e-3)
 
 
-@functools.cache
-def brute_table(metric: str) -> np.ndarray:
-    a, b = faces(3, 3, seed=1, n=16), faces(4, 2, seed=2, n=16)
-    return np.array([[BRUTE[metric](x, y) for y in b] for x in a])
-
-
-@pytest.mark.parametrize("name", BACKENDS)
-@pytest.mark.parametrize("metric", METRICS)
-def test_random_subspaces_agree_with_brute_force(metric: str, name: str):
-    seen = matrix(name, faces(3, 3, seed=1, n=16), faces(4, 2, seed=2, n=16), metric=metric)
-    rtol = 1e-6 if name == "exact" else 1e-4
-    np.testing.assert_allclose(seen, brute_table(metric), rtol=rtol)
-
-
 @pytest.mark.parametrize("name", BACKENDS)
 @pytest.mark.parametrize("metric", METRICS)
 def test_points_agree_with_brute_force(metric: str, name: str):

@@ -277,23 +277,6 @@ def test_what_is_left_is_named_in_pages(store: TemplateStore) -> None:
         store.rerotation.subjects_of_old_epochs("nobody")
 
 
-def test_an_interrupted_move_goes_on_where_it_stopped(store: TemplateStore) -> None:
-    people = People(store, 8)
-    for name in people.names:
-        people.enroll(name)
-    store.rerotation.begin("default")
-
-    def stop(count: int) -> None:
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        store.rerotation.move("default", binding(), batch=3, progress=stop)
-    assert store.rerotation.remaining("default") == 5
-    assert people.misses().max() < 1e-3  # in both epochs
-    assert store.rerotation.move("default", binding()) == 5
-    assert people.misses().max() < 1e-3
-
-
 def test_templates_of_another_contract_are_left_and_named(store: TemplateStore) -> None:
     people, foreign = People(store, 3), People(store, 3, m=M + 1)
     people.enroll("s000")
