@@ -4,7 +4,7 @@ An attacker who can write the database, but has no master key, can put back a ro
 It is a true row, so the service takes it. The log, which tells that it ended, is what shows it.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from typing import Any
@@ -123,71 +123,58 @@ def verify_log_and_records(
     return context.database.snapshot(work)
 
 
-def _keys(findings: LogFindings, api_keys: ApiKeys, connection: Connection) -> list[RecordProblem]:
+def _keys(
+    findings: LogFindings, api_keys: ApiKeys, connection: Connection
+) -> Iterator[RecordProblem]:
     try:
         keys = api_keys.read_all(connection)
     except StoreError:
-        return [RecordProblem(KEY_ALTERED, "a row that cannot be read")]
-    problems = []
+        yield RecordProblem(KEY_ALTERED, "a row that cannot be read")
+        return
     for key in keys:
         if not key.authentic:
-            problems.append(RecordProblem(KEY_ALTERED, f"key:{key.prefix}"))
+            yield RecordProblem(KEY_ALTERED, f"key:{key.prefix}")
         elif key.prefix in findings.ended_keys and key.revoked_at is None:
-            problems.append(RecordProblem(KEY_PUT_BACK, f"key:{key.prefix}"))
-    return problems
+            yield RecordProblem(KEY_PUT_BACK, f"key:{key.prefix}")
 
 
-def _tenants(findings: LogFindings, connection: Connection) -> list[RecordProblem]:
+def _tenants(findings: LogFindings, connection: Connection) -> Iterator[RecordProblem]:
     columns = TenantRow.id, TenantRow.name, TenantRow.template_enrollment
-    problems = []
     for tenant_id, name, template_enrollment in connection.execute(sa.select(*columns)):
         if tenant_id in findings.erased_tenants:
-            problems.append(RecordProblem(TENANT_PUT_BACK, name))
+            yield RecordProblem(TENANT_PUT_BACK, name)
         elif findings.settings.get(name, template_enrollment) != template_enrollment:
-            problems.append(RecordProblem(TENANT_ALTERED, name))
-    return problems
+            yield RecordProblem(TENANT_ALTERED, name)
 
 
 def _enrollments(
     findings: LogFindings, context: StoreContext, connection: Connection
-) -> list[RecordProblem]:
+) -> Iterator[RecordProblem]:
     query = (
         sa.select(TenantRow.name, SubjectRow.subject_id, TemplateRow.template_id)
         .join(SubjectRow, SubjectRow.tenant_id == TenantRow.id)
         .join(TemplateRow, TemplateRow.subject_pk == SubjectRow.id)
     )
-    problems = []
     for tenant, subject_id, template_id in connection.execute(query):
         pseudonym = context.signer.pseudonym(tenant, subject_id)
         digest = template_digest(template_id)
         if findings.templates.get(pseudonym, digest) != digest:
-            problems.append(RecordProblem(ENROLLMENT_PUT_BACK, pseudonym))
-    return problems
+            yield RecordProblem(ENROLLMENT_PUT_BACK, pseudonym)
 
 
 def _counts(
     findings: LogFindings, context: StoreContext, connection: Connection
-) -> list[RecordProblem]:
-    columns = (
-        FailedAttemptsRow.pseudonym,
-        FailedAttemptsRow.consecutive,
-        FailedAttemptsRow.total,
-        FailedAttemptsRow.last_failed_at,
-    )
-    stored = {row.pseudonym: row for row in connection.execute(sa.select(*columns))}
-    return [
-        RecordProblem(COUNT_LIFTED, pseudonym)
-        for pseudonym, failures in findings.failures.items()
-        if failures.last_at > context.clock() - _FORGOTTEN_AFTER
-        and not _holds(stored.get(pseudonym), failures)
-    ]
-
-
-def _holds(row: Any, failures: _Failures) -> bool:
-    """Whether a row counts what the log tells, and its last failure is the log's."""
-    return (
-        row is not None
-        and row.consecutive >= failures.consecutive
-        and row.total >= failures.total
-        and abs(row.last_failed_at - failures.last_at) < _SAME_WRITE
-    )
+) -> Iterator[RecordProblem]:
+    rows = connection.execute(sa.select(FailedAttemptsRow.__table__))
+    stored = {row.pseudonym: row for row in rows}
+    for pseudonym, failures in findings.failures.items():
+        row = stored.get(pseudonym)
+        # The row counts what the log tells, and its last failure is the log's.
+        holds = (
+            row is not None
+            and row.consecutive >= failures.consecutive
+            and row.total >= failures.total
+            and abs(row.last_failed_at - failures.last_at) < _SAME_WRITE
+        )
+        if not holds and failures.last_at > context.clock() - _FORGOTTEN_AFTER:
+            yield RecordProblem(COUNT_LIFTED, pseudonym)
