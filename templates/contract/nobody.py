@@ -32,28 +32,20 @@ _LIFTING = threading.Lock()
 
 
 class _Forms(NamedTuple):
-    """What the closed forms are made of; k numbers, of templates of m directions.
-
-    projector
-        H = E[DᵀD] of the bases D, (k, k).
-    foot
-        E[p] of the foot points p, (k,).
-    squared_foot
-        E[‖p‖²].
-    mixed
-        H − H², (k, k): by how much the projector varies.
-    shift
-        Covariance of the foot points that the points a template goes through bring, (k, k).
-    mean
-        μ, (k,).
-    """
+    """What the closed forms are made of; k numbers, of templates of m directions."""
 
     projector: Array64
+    """H = E[DᵀD] of the bases D, (k, k)."""
     foot: Array64
+    """E[p] of the foot points p, (k,)."""
     squared_foot: float
+    """E[‖p‖²]."""
     mixed: Array64
+    """H − H², (k, k): by how much the projector varies."""
     shift: Array64
+    """Covariance of the foot points that the points a template goes through bring, (k, k)."""
     mean: Array64
+    """μ, (k,)."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -57,23 +57,11 @@ class Moments:
 
 
 def fit_moments(descriptors: NDArray[np.floating]) -> Moments:
-    """Estimate the moments of faces.
+    """Estimate the moments of faces: of unit rows (N, n), N ≥ 100, by which they vary.
 
-    Parameters
-    ----------
-    descriptors
-        float32, shape (N, n), unit rows (tolerance 1e-3), N ≥ 100; several thousand give good
-        decoys, and with N < n single people could be recognised in the result.
-
-    Raises
-    ------
-    DecoyError
-        Too few embeddings, embeddings that are not finite unit vectors, or that hardly vary.
-
-    Notes
-    -----
-    The variance along a sample's own principal axes is biased: too large along the first, too small
-    along the last. So it is estimated on embeddings that took no part in finding the axes
+    Several thousand give good decoys, and with N < n single people could be recognised in the
+    result. The variance along a sample's own principal axes is biased: too large along the first,
+    too small along the last. So it is estimated on embeddings that took no part in finding the axes
     (D. Bartz, "Cross-validation based nonlinear shrinkage", 2016).
     """
     faces = checked_descriptors(descriptors)

@@ -82,27 +82,15 @@ class DecoySource(Protocol):
         unlike: Sequence[Attributes] | None = None,
         sub_databases: int | None = None,
     ) -> NDArray[np.float32]:
-        """Draw ``k`` decoys for each of ``rows`` templates.
+        """Draw ``k`` decoys for each of ``rows`` templates, from a stream.
 
-        Parameters
-        ----------
-        rows, k
-            Number of templates, and of decoys in each.
-        stream
-            The only source of randomness.
-        unlike
-            One entry per row: that row's decoys differ from it in gender and in race (hybrid+).
-        sub_databases
-            Number S of disjoint parts; all decoys of a row come from one part, chosen at random.
+        With ``unlike``, one entry per row, that row's decoys differ from it in gender and in race
+        (hybrid+). With ``sub_databases`` S all decoys of a row come from one of S disjoint parts,
+        chosen at random.
 
         Returns
         -------
         float32, shape (rows, k, number of axes)
             Unit rows, C-contiguous; no decoy twice inside one row.
-
-        Raises
-        ------
-        DecoyError
-            The source cannot meet the request.
         """
         ...

@@ -74,25 +74,13 @@ class Rerotation:
         """Bring stored templates of older epochs into the current one; returns how many.
 
         Template id, metadata and times stay; the data key is a new one. It may be interrupted, run
-        again, and run by several processes at once, beside a service in use.
+        again, and run by several processes at once, beside a service in use: each transaction, for
+        which every other write waits, takes `batch` templates. Those of another contract than the
+        binding's are left to be enrolled again.
 
-        Parameters
-        ----------
-        binding
-            Of the contract that they belong to. Templates of any other are left to be enrolled
-            again.
-        batch
-            Templates in one transaction, for which every other write waits.
-        progress
-            Called after each transaction with the number of templates that it moved.
-        by
-            Who moves, for the audit log: it gets one line at the end, if anything was moved.
-
-        Raises
-        ------
-        UnknownTenant
-        StoreError
-            At the end, if rows do not open or hold no template. All others are moved.
+        `progress` is called after each transaction with the number of templates that it moved. The
+        audit log gets one line at the end, if anything was moved. :class:`StoreError` then, if rows
+        do not open or hold no template; all others are moved.
         """
         database, total, broken, after = self._context.database, 0, 0, ""
         rotations = _Rotations(self._tenants, tenant, binding)

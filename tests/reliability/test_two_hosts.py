@@ -31,8 +31,8 @@ WAITS = "wait_event_type = 'Lock'"
 
 @pytest.fixture
 def network() -> Iterator[Network]:
-    """Two hosts, and a third where a client is."""
-    with Network(3) as made:
+    """Two hosts, and the bridge between them."""
+    with Network(2) as made:
         yield made
 
 
