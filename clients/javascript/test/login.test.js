@@ -210,6 +210,7 @@ test("a camera that ends is said and told, and ends the attempt", async () => {
   await settled();
   tracks[0].dispatchEvent(new Event("ended"));
   assert.deepEqual([tracks[1].stopped, told.length], [false, 1], "the one before");
+  login.leave();
 });
 
 test("the camera stays on only where another photo, or the passkey, may help", async () => {
