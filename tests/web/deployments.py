@@ -95,8 +95,9 @@ def moving_service(folder: Path) -> Iterator[Served]:
     pack = write_marked_pack(folder / "pack")
     deployment = deploy(folder, pack=pack)
     flags = ["--data-dir", str(folder / "data"), "--pack", str(pack)]
-    flags += ["--liveness", "active", "--lockout-after", "0"]
-    with serving(folder, deployment.settings, *flags, token=deployment.token) as served:
+    flags += ["--liveness", "active"]
+    unlocked = {"VEILFACE_LOCKOUT_AFTER": "0"}
+    with serving(folder, deployment.settings, *flags, token=deployment.token, **unlocked) as served:
         with served.client() as client:
             files = images(frame(person=ANNA))
             assert client.put("/v1/subjects/anna/enrollment", files=files).status_code == 201

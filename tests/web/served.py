@@ -46,20 +46,21 @@ class Served:
 
 @contextmanager
 def serving(
-    folder: Path, settings: Settings, *options: str, token: str | None = None
+    folder: Path, settings: Settings, *options: str, token: str | None = None, **named: str
 ) -> Iterator[Served]:
-    """Start the command with these options; without a token, make a key with all rights."""
+    """Start the command with options and variables; without a token, make one of all rights."""
     port = free_port()
     log = folder / "page.log"
     # Every tab asks for the whole page anew: dozens a minute are more than one address may.
-    options = (*options, "--port", str(port), "--rate-limit-address", "off")
+    options = (*options, "--port", str(port))
+    named = {"VEILFACE_RATE_LIMIT_ADDRESS": "off", **named}
     environment = {k: v for k, v in os.environ.items() if not k.startswith("VEILFACE_")}
     with log.open("wb") as errors:
         process = subprocess.Popen(
             [sys.executable, "-m", "veilface", "serve", *options],
             stdout=subprocess.DEVNULL,
             stderr=errors,
-            env={**environment, "PYTHONUNBUFFERED": "1", "OMP_NUM_THREADS": "1"},
+            env={**environment, **named, "PYTHONUNBUFFERED": "1", "OMP_NUM_THREADS": "1"},
         )
     try:
         url = f"http://127.0.0.1:{port}"

@@ -119,7 +119,7 @@ class Flows:
         return self._send(results.Receipt, "DELETE", _path(subject))
 
     def lockout(self, subject: str) -> Flow[results.Lockout]:
-        """Count the failed attempts; :class:`NotFound` where there are none. Right: ``admin``."""
+        """Count the failed attempts; ``not_found`` where there are none. Right: ``admin``."""
         return self._send(results.Lockout, "GET", _path(subject, "/lockout"))
 
     def reset_lockout(self, subject: str) -> Flow[results.Unlocked]:
