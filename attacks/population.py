@@ -18,8 +18,6 @@ from templates.space.embedding import normalised, unit_descriptors
 ENROLLED_PHOTOS = 3
 """Most photos that are averaged into a victim's template."""
 LEAST_ALBUM = 3
-LEAST_FITTED = 100
-"""Least that a decoy generator is fitted to."""
 LEAST_OTHERS = 200
 
 Array = NDArray[np.float32]

@@ -36,11 +36,11 @@ from attacks.attributes.audit import (
 )
 from attacks.attributes.plan import OUR_DIMS, PAPER_DIMS, AttributePlan, schemes_of
 from attacks.outcomes import GENERATED, RAW, Scheme
-from attacks.population import LEAST_FITTED
 from attacks.report import document
 from models.pack import ModelPack
 from templates.contract.document import Binding
 from templates.decoys import DecoyGenerator
+from templates.decoys.fitting import MIN_DESCRIPTORS
 from templates.distances import on_device
 from templates.space.lifting import Strategy
 from verify.preparation import acquired_json
@@ -68,7 +68,7 @@ def fairface(
     lifting: Annotated[
         int | None,
         typer.Option(
-            min=LEAST_FITTED,
+            min=MIN_DESCRIPTORS,
             help="Training faces that are the lifting database. Unset: the paper's 10,000, or "
             "three tenths of a smaller training set.",
         ),
@@ -93,9 +93,6 @@ def fairface(
             help="Dimensions of adversarial lifting with generated decoys, beside --service-dim."
         ),
     ] = ",".join(map(str, OUR_DIMS)),
-    neighbours: Annotated[
-        int, typer.Option("--k", min=1, help="Neighbours of the paper's attacker.")
-    ] = 10,
     decoys: Annotated[
         Path | None,
         typer.Option(
@@ -165,7 +162,6 @@ def fairface(
     labels = fairface_labels(root, "train"), fairface_labels(root, "val")
     plan = AttributePlan(
         schemes=schemes,
-        k=neighbours,
         lifting=default_lifting(len(labels[0])) if lifting is None else lifting,
         attack=attack,
         attacked=attacked,
@@ -191,7 +187,7 @@ def fairface(
             "lifting": len(parts.lifting),
             "attack": len(parts.attack),
             "attacked": len(parts.attacked),
-            "k": neighbours,
+            "k": plan.k,
             "decoys": "of the lifting faces" if generator is None else generator.source_id,
             "audited": str(audited),
             "flip": flip,

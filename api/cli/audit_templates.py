@@ -29,9 +29,9 @@ from api.cli.results import Plan, Result, reports
 from api.service.opening import file_sealer, open_keyring
 from api.settings import Settings
 from attacks.audit import AuditPlan, run_audit
-from attacks.population import LEAST_FITTED
 from attacks.report import document
 from templates.contract.document import Contract
+from templates.decoys.fitting import MIN_DESCRIPTORS
 from templates.distances import on_device
 from templates.space.lifting import Strategy
 from verify import labelled_folder
@@ -86,7 +86,7 @@ def templates(
     owners: Annotated[
         int,
         typer.Option(
-            min=LEAST_FITTED,
+            min=MIN_DESCRIPTORS,
             help="People whose faces are the real decoys of the comparison.",
         ),
     ] = 600,

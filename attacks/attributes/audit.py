@@ -18,9 +18,9 @@ from attacks.outcomes import (
     Property,
     Scheme,
 )
-from attacks.population import LEAST_FITTED
 from models.extraction import Extraction
 from templates.decoys import DecoyGenerator
+from templates.decoys.fitting import MIN_DESCRIPTORS
 from verify.fairface_labels import CLASSES, Label
 from verify.own_decoys import require_others
 
@@ -38,7 +38,7 @@ _HAS = {
 
 def default_lifting(training: int) -> int:
     """Size of the lifting database: the paper's, or three tenths of a smaller training set."""
-    return min(PAPER_LIFTING, max(LEAST_FITTED, int(LIFTING_SHARE * training)))
+    return min(PAPER_LIFTING, max(MIN_DESCRIPTORS, int(LIFTING_SHARE * training)))
 
 
 def labelled_faces(photos: Extraction, labels: Mapping[Path, Label]) -> LabelledFaces:

@@ -56,20 +56,10 @@ class LabelledFaces:
         labels: Mapping[str, Sequence[str]],
         classes: Mapping[str, Sequence[str]],
     ) -> "LabelledFaces":
-        """Make codes of the names of labels.
-
-        Raises
-        ------
-        AuditError
-            A label is none of its classes.
-        """
+        """Make codes of the names of labels, each of which is one of the attribute's classes."""
         codes: dict[str, Codes] = {}
         for attribute, names in labels.items():
-            place = {name: i for i, name in enumerate(classes.get(attribute, ()))}
-            if unknown := sum(name not in place for name in names):
-                raise AuditError(
-                    f"{unknown} of {len(names)} labels of {attribute} are no class of it"
-                )
+            place = {name: i for i, name in enumerate(classes[attribute])}
             codes[attribute] = np.array([place[name] for name in names], dtype=np.int64)
         return cls(embeddings, codes, {name: tuple(of) for name, of in classes.items()})
 

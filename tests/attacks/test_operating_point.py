@@ -221,12 +221,6 @@ def test_a_few_second_photos_do_not_leave_the_others_unattacked() -> None:
     assert len(mixed.victims) == 2 * LEAST_VICTIMS
 
 
-def test_a_dimension_above_the_axes_that_are_tried_takes_all_axes() -> None:
-    setup = people(300, FACES).halves()[0]
-    axes, m, _, _ = choose(setup, strategy=Strategy.ADVERSARIAL, m=46)
-    assert (axes, m) == (setup.source.k, 46)
-
-
 def test_a_group_that_is_shown_to_be_above_is_not_hidden_by_a_small_one() -> None:
     big = GroupRates("kind", "big", Rate(30_000, 10**6, 0.0, 1.0), RATE_OF_GROUP, True, True)
     small = GroupRates("kind", "small", Rate(4, 100, 0.0, 1.0), RATE_OF_GROUP, True, True)

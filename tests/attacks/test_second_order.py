@@ -137,8 +137,3 @@ def test_people_are_as_far_from_decoys_as_faces_are_without_their_sampling_error
     true = distance(second_moment(unit(rng.normal(size=(400_000, N)) * FACES)))
     assert distance(as_far_as_faces(fitting, decoys)) < 0.5 * distance(second_moment(fitting))
     assert distance(as_far_as_faces(other, decoys)) == pytest.approx(true, rel=0.1)
-
-
-def test_moments_of_nothing_are_refused() -> None:
-    with pytest.raises(AuditError, match="no spread"):
-        Moments.of(np.zeros((N, N)))

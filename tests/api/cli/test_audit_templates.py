@@ -251,12 +251,6 @@ def test_a_contract_of_other_decoys_says_no_dimension(world: World) -> None:
 
 
 @pytest.mark.long
-def test_every_property_is_attacked(people_report: Any) -> None:
-    properties = {row["property"] for row in people_report["outcomes"]}
-    assert properties == set(map(str, Property)) - {str(Property.CONFIDENTIALITY)}
-
-
-@pytest.mark.long
 def test_an_attack_that_exceeds_its_limit_is_status_1(
     people: TemplateAudit, people_report: Any
 ) -> None:

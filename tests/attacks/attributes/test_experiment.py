@@ -132,13 +132,6 @@ def attacked_with_flat_decoys(scheme: Scheme, draw: int) -> ByAttacker:
     return {(row.attacker, row.attribute): row for row in run_scheme(flat, scheme)}
 
 
-def test_tiles_change_nothing_but_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    some = prepare(SMALL, plan=PLAN)
-    whole = run_scheme(some, RAW_SCHEME)
-    monkeypatch.setattr(experiment, "_TILE_ROWS", 7)
-    assert run_scheme(some, RAW_SCHEME) == whole
-
-
 def test_a_seed_gives_the_same_figures() -> None:
     runs = [
         [

@@ -68,13 +68,6 @@ def test_discriminants_are_those_of_scikit_learn() -> None:
     assert own @ axis > 0.99
 
 
-def test_a_class_without_a_face_gives_finite_axes() -> None:
-    some = GALLERY.take(np.flatnonzero(GALLERY.labels["race"] != 2))
-    axes = Axes.fit(some)
-    assert np.isfinite(axes.discriminants).all()
-    assert np.isfinite(axes.prototypes).all()
-
-
 def test_raw_embeddings_have_the_scores_and_votes() -> None:
     raw = VICTIMS.embeddings
     near = nearest_neighbours(raw, GALLERY.embeddings, k=20)

@@ -1,14 +1,12 @@
 """The figure shows the numbers of the rows."""
 
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
 from matplotlib.patches import Rectangle
 
 from attacks.attributes.figure import attribute_figure
-from verify.evaluation.figures.style import write
 
 
 def rows() -> Iterator[dict[str, Any]]:
@@ -55,13 +53,4 @@ def test_bars_are_the_papers_attacker_and_markers_the_strongest() -> None:
         assert list(marks.get_ydata()) == pytest.approx([95, 85, 75, 65, 55])
         levels = [line.get_ydata()[0] for line in axes.lines if len(set(line.get_ydata())) == 1]
         assert {53.0, 50.0} <= set(levels)
-
-
-def test_no_neighbours_no_figure_and_the_same_bytes_twice(tmp_path: Path) -> None:
     assert attribute_figure([row for row in rows() if row["attacker"] != "knn"]) is None
-    figure = attribute_figure(list(rows()))
-    assert figure is not None
-    first = [path.read_bytes() for path in write(figure, tmp_path, "a")]
-    again = attribute_figure(list(rows()))
-    assert again is not None
-    assert [path.read_bytes() for path in write(again, tmp_path, "b")] == first
