@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from api.cli.console import demo_notice, message
+from api.cli.console import demo_notice
 from api.cli.errors import FAILED, UsageError
 from api.cli.results import Result, Table
 from api.settings import Settings
@@ -17,7 +17,6 @@ from attacks.verdict import LIMITS
 from models.pack import ModelPack
 from templates.contract.document import Binding, Contract
 from templates.decoys import DecoySource
-from templates.errors import VeilfaceError
 from templates.keys.private_file import replace_public
 from templates.keys.sealing import Sealer
 from verify.preparation import recorded_of
@@ -100,18 +99,11 @@ def reported(report: Document, out: Path, pack: ModelPack) -> Result:
 
 
 def served_scheme(settings: Settings, sealer: Sealer, source: DecoySource | None) -> Binding | None:
-    """Return the scheme of the contract in ``data_dir``, where it lifts with this source.
-
-    None, and a note, where it cannot be read: an audit does not need it.
-    """
+    """Return the scheme of the contract in ``data_dir``, where it lifts with this source."""
     path = settings.resolved_contract_file
     if source is None or not path.is_file():
         return None
-    try:
-        binding = Contract.load(path, sealer).binding
-    except VeilfaceError as error:
-        message(f"note: not auditing as the contract in `data_dir` has it: {error}")
-        return None
+    binding = Contract.load(path, sealer).binding
     fits = binding.axes <= source.k and (
         binding.decoy_source_id == source.reduced(binding.axes).source_id
     )

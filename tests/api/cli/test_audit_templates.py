@@ -15,7 +15,6 @@ import pytest
 import attacks.audit
 from api.cli import audit_templates
 from api.cli.audit_report import served_scheme
-from api.cli.options import DEFAULT_DIM
 from api.service.opening import file_sealer, open_keyring
 from api.settings import Settings
 from attacks.audit import AuditPlan, AuditResult
@@ -202,18 +201,6 @@ def test_what_is_not_set_is_the_contracts(
 
     monkeypatch.setattr(audit_templates, "served_scheme", served)
     assert planned(world, tmp_path, monkeypatch, *given) == (plan, said)
-
-
-def test_a_contract_that_cannot_be_read_stops_no_audit(
-    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    broken = tmp_path / "contract.json"
-    broken.write_text("{", encoding="utf-8")
-    monkeypatch.setattr(Settings, "resolved_contract_file", broken)
-    found, said = planned(world, tmp_path, monkeypatch)
-    assert found == ((DEFAULT_DIM,), "adversarial")
-    assert said is not None
-    assert said.startswith("not auditing as the contract")
 
 
 def planned(
