@@ -9,7 +9,6 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from templates.space.subspace import SubspaceBatch
 from verify.thresholds import Genuine
@@ -53,22 +52,6 @@ def test_no_dataclass_shows_private_numbers(package: str) -> None:
     kinds = list(dataclasses_of(package))
     assert kinds, f"the package {package} has no dataclass: is it still found?"
     assert {kind.__qualname__: names for kind in kinds if (names := shown(kind))} == {}
-
-
-def test_the_walk_sees_what_would_show() -> None:
-    @dataclasses.dataclass
-    class Open:
-        rows: NDArray[np.float32]
-        parts: tuple[bytes, ...] | None
-        name: str
-        hidden: bytes = dataclasses.field(repr=False)
-
-    @dataclasses.dataclass(repr=False)
-    class Closed:
-        rows: NDArray[np.float32]
-
-    assert shown(Open) == ["rows", "parts"]
-    assert shown(Closed) == []
 
 
 def test_scores_do_not_show() -> None:

@@ -17,7 +17,7 @@ import typer
 from numpy.typing import NDArray
 
 from api.cli.console import progress
-from api.cli.inputs import listed_dims, listed_names, listed_numbers
+from api.cli.inputs import listed_dims, listed_numbers
 from api.cli.options import PROCESSOR, Device, chosen_device
 from api.cli.results import Result, Table, reports
 from api.settings import processors
@@ -43,12 +43,6 @@ def distances(
     ] = 1000,
     n: Annotated[str, typer.Option("--n", help="Numbers in an embedding.")] = "128,512",
     dim: Annotated[str, typer.Option(help="Dimensions m of the subspaces.")] = "2,4,8,16",
-    mode: Annotated[
-        str, typer.Option(help="`p2s` compares points with templates, `s2s` lifted probes.")
-    ] = "p2s,s2s",
-    metric: Annotated[
-        str, typer.Option(help="`euclidean` is the paper's, `spherical` the service's.")
-    ] = "euclidean,spherical",
     repeats: Annotated[
         int, typer.Option(min=1, help="Timed repeats; medians of them are shown.")
     ] = 5,
@@ -57,19 +51,20 @@ def distances(
     """Time all distances between probes and templates, beside the bare matrix product.
 
     Needs the extra `evaluate`. It draws embeddings of nobody, spread like faces, and lifts them.
-    `× product` is a time as a multiple of the matrix product that a distance starts from, in the
-    same run; `authors` is the paper's Euclidean formula as its authors compute it, in multiples of
-    our time. The default options take some minutes, half a minute more at the first run.
+    Points are compared with templates (`p2s`), and lifted probes (`s2s`); Euclidean distances are
+    the paper's, spherical ones the service's. `× product` is a time as a multiple of the matrix
+    product that a distance starts from, in the same run; `authors` is the paper's Euclidean formula
+    as its authors compute it, in multiples of our time. The default options take some minutes.
 
-    Example: `veilface bench distances --n 512 --dim 16 --metric spherical`
+    Example: `veilface bench distances --n 512 --dim 16`
     """
     sizes = listed_numbers(n, "--n", least=2)
     dims = listed_dims(dim, "--dim", n=min(sizes), example="8,16")
     cells = [
-        (size, m, kind, Metric(name))
+        (size, m, kind, name)
         for size, m in product(sizes, dims)
-        for kind in listed_names(mode, ("p2s", "s2s"), "--mode")
-        for name in listed_names(metric, tuple(Metric), "--metric")
+        for kind in ("p2s", "s2s")
+        for name in Metric
     ]
     on = chosen_device(device)
     if on is None:

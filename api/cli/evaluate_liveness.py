@@ -65,7 +65,6 @@ def evaluate_liveness(
         str | None,
         typer.Option(help="Level of the whole verification. Unset: the contract's default."),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed for the random choices.")] = 0,
     out: Annotated[Path, typer.Option(help="Folder of the results.")] = Path("liveness"),
     _plan: Plan = None,
 ) -> Result:
@@ -100,9 +99,7 @@ def evaluate_liveness(
     scored = score_with_progress(pack, presented)
     require_responses(scored)
     points, refused = _points(scored, bound, targets)
-    verified, unverified = _verified(
-        scored, pack, bound, settings, decoys=decoys, level=level, seed=seed
-    )
+    verified, unverified = _verified(scored, pack, bound, settings, decoys=decoys, level=level)
     results = document(
         scored,
         Model(pack.info.n, recorded_of(pack), pack.info.embedder_sha256, pack.info.preprocessing),
@@ -187,7 +184,6 @@ def _verified(
     *,
     decoys: Path | None,
     level: str | None,
-    seed: int,
 ) -> tuple[VerifiedSet | None, str | None]:
     """Verify the photos, or say why that was not done."""
     if contract is None:
@@ -199,7 +195,7 @@ def _verified(
         return None, "it takes the contract's decoys (--decoys)"
     source = load_decoys(file, file_sealer(open_keyring(settings)), pack)
     source = source.reduced(contract.binding.axes)
-    verified = verify_presentations(scored, pack.info, contract, source, level=level, seed=seed)
+    verified = verify_presentations(scored, pack.info, contract, source, level=level, seed=0)
     if not verified.enrolled:
         return None, (
             f"no subject has {verified.enrolled_photos} live photos that agree, to be enrolled by"

@@ -1,7 +1,6 @@
 """``veilface models``: fetching model packs, and what is in one."""
 
 import re
-import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -94,7 +93,8 @@ def fetch(
         raise UsageError("give --sha256 once for each --from, in the same order, or never")
     if target.exists():
         raise CommandError(f"{target} is there already; remove it, or take another name")
-    _require_licence(accept_licence)
+    if not accept_licence:
+        raise UsageError("say --accept-licence once you have read the licence of the weights")
     pins: Sequence[str | None] = sha256 or [None] * len(sources)
     into.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".fetch-", dir=into) as scratch:
@@ -118,14 +118,6 @@ def fetch(
         {"out": target, "sha256": digests, "pack": _described(pack)},
         f"{target}: {usable(pack.info)}",
     )
-
-
-def _require_licence(accepted: bool) -> None:
-    if accepted:
-        return
-    if not sys.stdin.isatty():
-        raise UsageError("say --accept-licence once you have read the licence of the weights")
-    typer.confirm("Have you read the licence, and may you use the weights?", abort=True, err=True)
 
 
 def _described(pack: ModelPack) -> dict[str, object]:

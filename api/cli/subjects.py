@@ -23,7 +23,6 @@ from enroll.enroller import MAX_PHOTOS
 from models.errors import ModelError, PhotoRejected
 from models.pack import ModelPack
 from models.selection import FacePolicy
-from templates.decoys import Attributes
 from templates.errors import StoreBusy, StoreUnavailable, VeilfaceError
 from templates.space.agreement import InconsistentImages
 from templates.store.audit_log import Entry
@@ -61,38 +60,30 @@ def enroll(
             f"the id. At most {MAX_PHOTOS} photos of each are taken.",
         ),
     ] = None,
-    gender: Annotated[
-        str | None,
-        typer.Option(help="For a hybrid+ contract: used for lifting, never stored."),
-    ] = None,
-    race: Annotated[
-        str | None,
-        typer.Option(help="For a hybrid+ contract: used for lifting, never stored."),
-    ] = None,
     tenant: Tenant = DEFAULT_TENANT,
     face: Face = FacePolicy.DOMINANT,
 ) -> Result:
     """Enroll a person from photos, or replace their enrollment; or enroll many with --from.
 
     Needs: what `serve` needs (contract, decoys, pack); the service may run meanwhile. Three photos
-    are better than one. Only the private template is stored. With --from, exit status 1 means that
+    are better than one. Only the private template is stored. A hybrid+ contract takes attributes of
+    a person, which REST alone does. With --from, exit status 1 means that
     somebody was not enrolled; the others are.
 
     Example: `veilface enroll alice alice-1.jpg alice-2.jpg alice-3.jpg --pack buffalo_l`
     """
-    attributes = Attributes(gender, race)
     if people is not None:
         if subject is not None:
             raise UsageError("--from enrolls many: no SUBJECT beside it")
         albums, left_out = albums_of(people)
         with _opened(settings, tenant) as entrance:
-            return _enrolled_all(entrance, albums, left_out, attributes, face)
+            return _enrolled_all(entrance, albums, left_out, face)
     if subject is None or not photos:
         raise UsageError("name a person and 1 to 10 photos; or many people with --from")
     if len(photos) > MAX_PHOTOS:
         raise UsageError(f"an enrollment has 1 to {MAX_PHOTOS} photos, not {len(photos)}")
     with _opened(settings, tenant) as entrance:
-        facts = _enrolled(entrance, checked_subject_id(subject), photos, attributes, face)
+        facts = _enrolled(entrance, checked_subject_id(subject), photos, face)
         _note_privacy(entrance.runtime)
     done = "Replaced the enrollment of" if facts["replaced"] else "Enrolled"
     return Result(
@@ -114,7 +105,6 @@ def _enrolled_all(
     entrance: _Entrance,
     albums: dict[str, list[Path]],
     left_out: dict[str, str],
-    attributes: Attributes,
     face: FacePolicy,
 ) -> Result:
     """Enroll everybody who can be, and say who could not and why.
@@ -129,7 +119,7 @@ def _enrolled_all(
             try:
                 if outage is None:
                     photos = album[:MAX_PHOTOS]
-                    enrolled.append(_enrolled(entrance, subject, photos, attributes, face))
+                    enrolled.append(_enrolled(entrance, subject, photos, face))
                 else:
                     failed[subject] = outage
             except (VeilfaceError, ModelError, OSError) as error:
@@ -162,7 +152,6 @@ def _enrolled(
     entrance: _Entrance,
     subject: str,
     photos: Sequence[Path],
-    attributes: Attributes,
     face: FacePolicy,
 ) -> dict[str, Any]:
     """Enroll somebody from photos; returned is what ``--json`` says of it."""
@@ -170,9 +159,7 @@ def _enrolled(
     data = [read_photo(photo) for photo in photos]
     epoch = runtime.epoch(tenant)
     with _named(photos):
-        enrollment = runtime.enroller(tenant, epoch).from_photos(
-            entrance.pack, data, attributes=attributes, policy=face
-        )
+        enrollment = runtime.enroller(tenant, epoch).from_photos(entrance.pack, data, policy=face)
     stored = runtime.put(
         tenant,
         subject,

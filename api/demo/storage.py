@@ -23,8 +23,6 @@ class Stored:
     """What the database's file holds of one person; the excerpt is ciphertext."""
 
     name: str
-    n: int
-    m: int
     template_bytes: int
     foot_norm: float
     ciphertext_bytes: int
@@ -59,8 +57,6 @@ def read_stored(folder: Path, names: Sequence[str]) -> tuple[Stored, ...]:
             stored.append(
                 Stored(
                     name=name,
-                    n=subject.record.n,
-                    m=subject.record.m,
                     template_bytes=len(subject.wire),
                     foot_norm=float(wire.decode(subject.wire).subspace.foot_norm),
                     ciphertext_bytes=len(ciphertext),

@@ -57,14 +57,6 @@ def test_verify_does_not_fail_with_the_status_of_a_rejection(error):
     assert CliRunner().invoke(app, ["fail"]).exit_code == 1
 
 
-def test_a_command_that_cannot_be_imported_has_failed(monkeypatch):
-    monkeypatch.setitem(sys.modules, "api.cli.subjects", None)
-    for name, status in (("verify", 3), ("enroll", 1)):
-        ran = run(name, "ann", "x.jpg")
-        assert (ran.status, ran.stdout) == (status, "")
-        assert "a defect of veilface (ModuleNotFoundError" in ran.stderr
-
-
 ROOT = Path(__file__).resolve().parents[3]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 MODULES = {"scikit-image": "skimage", "scikit-learn": "sklearn"}

@@ -14,7 +14,6 @@ import pytest
 from api.cli.pack_download import shown
 from models.demo import build_demo_pack
 from models.known_packs import KNOWN_PACKS
-from models.pack import ModelPack
 from tests.api.cli.conftest import Ran, run
 from tests.ports import free_port
 
@@ -116,21 +115,6 @@ def test_a_pin_is_held(site: Site, graph: bytes) -> None:
     assert nothing_is_left()
     assert fetch("mine", "--from", f"{site.url}/rec.onnx", "--sha256", right.upper()).status == 0
     assert fetch("x", "--from", "a.onnx", "--sha256", wrong, "--sha256", wrong).status == 2
-
-
-def test_preprocessing_is_stated_where_the_graph_does_not(site: Site, graph: bytes) -> None:
-    site.files["/rec.onnx"] = graph
-    address = f"{site.url}/rec.onnx"
-    assert fetch("mine", "--from", address, "--preprocessing", "imagenet").status == 0
-    stated = ModelPack.load("packs/mine").info.preprocessing
-    # torchvision's figures for pixels from 0 to 1.
-    assert stated["mean"] == pytest.approx([255 * x for x in (0.485, 0.456, 0.406)])
-    assert stated["scale"] == pytest.approx([255 * x for x in (0.229, 0.224, 0.225)])
-    assert stated["channel_order"] == "rgb"
-    site.files["/two.zip"] = zipped({"rec.onnx": graph, "pack.toml": b"[embedder]\nscale = 1.0\n"})
-    refused = fetch("two", "--from", f"{site.url}/two.zip", "--preprocessing", "arcface")
-    assert (refused.status, "has a pack.toml" in refused.stderr) == (2, True)
-    assert not Path("packs/two").exists()
 
 
 def test_what_cannot_be_used_is_not_kept(site: Site, graph: bytes) -> None:
