@@ -90,3 +90,10 @@ def test_options_of_a_wrong_kind_are_refused(bench, tmp_path):
         assert wrong[0] in ran.stderr
         assert "Traceback" not in ran.stderr
     assert run("evaluate", tmp_path / "absent", *bench.base).status == 1
+
+
+def test_a_cluster_that_is_not_there_is_said_in_one_sentence(bench, tmp_path, monkeypatch):
+    monkeypatch.setattr("verify.evaluation.cluster.CONNECT_SECONDS", 0.5)
+    ran = run(*bench.full, "--cluster", "tcp://127.0.0.1:1", "--out", tmp_path / "out")
+    assert (ran.status, ran.stdout) == (1, "")
+    assert "error: no Dask scheduler answers at tcp://127.0.0.1:1" in ran.stderr
