@@ -71,16 +71,13 @@ def evaluate_liveness(
     """Evaluate the pack's liveness graphs on live and attack photos (ISO/IEC 30107-3).
 
     Reports APCER by species, BPCER, photos without a face and, with a contract, its decoys and
-    subjects, IAPMR. Writes results.json, results.csv, results.md and a DET figure to --out.
+    subjects, IAPMR. Writes results.json, results.csv and results.md to --out.
     docs/liveness.md says what such graphs cannot see.
 
     Example: `veilface evaluate liveness photos --pack buffalo_l --contract contract.json
     --out liveness-results`
     """
     require_extra("evaluate")
-    # Imported here: drawing loads a library that nothing else needs.
-    from verify.evaluation.figures import liveness_figure
-
     targets = listed(bpcer, float, "--bpcer", expected="rates such as 0.01,0.05")
     if not all(0 < target < 1 for target in targets):
         raise UsageError("--bpcer takes rates between 0 and 1")
@@ -111,7 +108,7 @@ def evaluate_liveness(
         refused=refused,
     )
     out.mkdir(parents=True, exist_ok=True)
-    written = write_results(results, markdown(results), {"det": liveness_figure}, out)
+    written = write_results(results, markdown(results), {}, out)
     notice = demo_notice(pack.info.embedder_sha256, n=pack.info.n)
     facts = results["verification"]
     return Result(

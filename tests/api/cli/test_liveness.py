@@ -129,9 +129,7 @@ def test_what_is_reported_is_what_the_scores_and_the_verifier_say(
     said = {"notice": DEMO_NOTICE, "out": str(out), "files": ran.json["files"]}
     assert {**results, **said} == ran.json
     assert sorted(ran.json["files"]) == sorted(path.name for path in out.iterdir())
-    assert {path.name for path in out.iterdir()} == {
-        *("results.json", "results.csv", "results.md", "det.png", "det.svg")
-    }
+    assert {path.name for path in out.iterdir()} == {*("results.json", "results.csv", "results.md")}
     of = scores(liveness_pack, photos)
     live = [value for name, value in of.items() if name.startswith("live/")]
     rows = {(row["operating_point"], row["species"]): row for row in results["rows"]}

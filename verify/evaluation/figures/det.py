@@ -30,7 +30,6 @@ from verify.evaluation.row_labels import (
     preferred_metric,
     strategy_label,
 )
-from verify.metrics import wilson
 
 Look = dict[str, Any]
 RATE_TICKS = (1e-6, 1e-5, 1e-4, 1e-3, 0.01, 0.05, 0.2, 0.5, 0.8, 0.95, 0.99, 0.999)
@@ -56,7 +55,11 @@ def det_figure(results: Mapping[str, Any]) -> Figure | None:
     modes = [mode for mode in LIFTED_MODES if mode in present] or ["p2p"]
     looks: dict[str, Look] = {"raw": {"color": INK, "linewidth": 2.2, "zorder": 4}}
     with house_style():
-        figure, grid = _panels(len(names), len(modes))
+        width, height = PANEL_INCHES
+        widths, heights = [width] * len(modes), [height] * len(names)
+        figure, grid = panels(
+            len(names), len(modes), widths=widths, heights=heights, side=SIDE_INCHES
+        )
         for axes, (name, mode) in zip(
             (axes for line in grid for axes in line),
             [(name, mode) for name in names for mode in modes],
@@ -71,40 +74,9 @@ def det_figure(results: Mapping[str, Any]) -> Figure | None:
                 dash = DASHES[1] if 0 < curve["dim"] < largest else DASHES[0]
                 dim = f", m = {curve['dim']}" if curve["dim"] else ""
                 drawn.append((curve, look | {"linestyle": dash, "label": label + dim}))
-            draw_det(axes, drawn, "FMR", "FNMR")
+            _draw(axes, drawn)
             metric = next((METRIC_NAMES[c["metric"]] for c in shown if c["dim"]), None)
             axes.set_title(", ".join(filter(None, [name, MODE_NAMES[mode], metric])), loc="left")
-        _legend(figure)
-    return figure
-
-
-def liveness_figure(results: Row) -> Figure:
-    """Draw BPCER over APCER of each species, with the 95 % band of the BPCER.
-
-    A cross marks each threshold of the results on the curve of its species. An APCER of 0 is drawn
-    as that of half a photo, where the axis begins.
-    """
-    live = int(results["rows"][0]["bpcer"]["trials"])
-    half = {row["species"]: 0.5 / row["apcer"]["trials"] for row in results["rows"]}
-    drawn = []
-    for number, curve in enumerate(results["curves"]):
-        bands = np.array([wilson(rate * live, live) for rate in curve["bpcer"]])
-        apcer = np.maximum(curve["apcer"], half[curve["species"]])
-        rates = {"fmr": apcer, "fnmr": curve["bpcer"], "low": bands[:, 0], "high": bands[:, 1]}
-        drawn.append((rates, _look(number) | {"label": curve["species"]}))
-    with house_style():
-        figure, grid = _panels(1, 1)
-        axes = grid[0][0]
-        draw_det(axes, drawn, "APCER", "BPCER")
-        axes.plot(
-            [max(row["apcer"]["value"], half[row["species"]]) for row in results["rows"]],
-            [row["bpcer"]["value"] for row in results["rows"]],
-            marker="x",
-            color=QUIET,
-            linestyle="none",
-            label="threshold",
-        )
-        axes.set_title(f"{results['dataset']['name']}, presentation attacks", loc="left")
         _legend(figure)
     return figure
 
@@ -124,13 +96,6 @@ def shown_curves(curves: Sequence[Row], mode: str) -> list[Row]:
     return sorted(raw + lifted, key=order_of)
 
 
-def _panels(rows: int, columns: int) -> tuple[Figure, list[list[Axes]]]:
-    width, height = PANEL_INCHES
-    return panels(
-        rows, columns, widths=[width] * columns, heights=[height] * rows, side=SIDE_INCHES
-    )
-
-
 def _legend(figure: Figure) -> None:
     """Name every curve once, right of the panels."""
     handles = {
@@ -144,7 +109,7 @@ def _legend(figure: Figure) -> None:
 
 
 def _look(number: int) -> Look:
-    """Return how the curve of a strategy or species is drawn: hue and marker."""
+    """Return how the curve of a strategy is drawn: hue and marker."""
     return {
         "color": HUES[number % len(HUES)],
         "marker": MARKERS[number % len(MARKERS)],
@@ -155,7 +120,7 @@ def _look(number: int) -> Look:
     }
 
 
-def draw_det(axes: Axes, curves: Sequence[tuple[Row, Look]], x: str, y: str) -> None:
+def _draw(axes: Axes, curves: Sequence[tuple[Row, Look]]) -> None:
     """Draw the rate ``fnmr`` of each curve over its ``fmr``, with the band from low to high."""
     drawn = []
     for place, (curve, look) in enumerate(curves):
@@ -180,9 +145,9 @@ def draw_det(axes: Axes, curves: Sequence[tuple[Row, Look]], x: str, y: str) -> 
         getattr(axes, f"set_{axis}ticks")(ticks, names)
         getattr(axes, f"set_{axis}lim")((low_end, high_end))
     ends = [SMALLEST, 0.999]
-    axes.plot(ends, ends, color=QUIET, linewidth=0.9, label=f"{x} = {y}")
-    axes.set_xlabel(f"{x} %")
-    axes.set_ylabel(f"{y} %")
+    axes.plot(ends, ends, color=QUIET, linewidth=0.9, label="FMR = FNMR")
+    axes.set_xlabel("FMR %")
+    axes.set_ylabel("FNMR %")
     axes.grid(color=RULE, linewidth=0.8)
 
 

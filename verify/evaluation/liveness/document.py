@@ -3,9 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import ArrayLike
-
 from models.liveness import PassiveLiveness
 from templates.contract.document import Contract
 from templates.contract.levels import Rate
@@ -23,12 +20,11 @@ from verify.evaluation.markdown_cells import (
 from verify.evaluation.plan import Json
 from verify.evaluation.provenance import Model, software
 from verify.evaluation.tables import Cells, failure_list
-from verify.metrics import equal_error_rate, error_curve
+from verify.metrics import equal_error_rate
 
 FORMAT = "veilface liveness evaluation"
 VERSION = 1
 CONTRACT_POINT = "contract"
-CURVE_POINTS = 400
 
 
 @dataclass(frozen=True)
@@ -89,7 +85,6 @@ def document(
         "eer": {name: equal_error_rate(live, scored.scored(name))[0] for name in species},
         "verification": verification,
         "refused": list(refused),
-        "curves": [_curve(live, scored.scored(name), name) for name in species],
     }
 
 
@@ -122,15 +117,6 @@ def _rows(
 
 def _rate(rate: Rate) -> Json:
     return {"value": rate.value if rate.trials else None, **rate.to_json()}
-
-
-def _curve(live: ArrayLike, attacks: ArrayLike, species: str) -> Json:
-    """APCER and BPCER at every threshold, thinned to a size that a figure shows."""
-    curve = error_curve(live, attacks)
-    total = len(curve.thresholds)
-    kept = np.unique(np.linspace(0, total - 1, min(total, CURVE_POINTS)).round().astype(int))
-    rates = {"apcer": curve.fmr[kept].tolist(), "bpcer": curve.fnmr[kept].tolist()}
-    return {"species": species, **rates}
 
 
 def row_cells(rows: Sequence[Json]) -> Cells:
