@@ -59,26 +59,14 @@ def turn(pixels: int) -> Iterator[None]:
 
 @dataclass(frozen=True, kw_only=True)
 class ImageLimits:
-    """What a picture may cost before its pixels are decoded.
+    """What a picture may cost before its pixels are decoded."""
 
-    Attributes
-    ----------
-    max_bytes
-        Size of the encoded picture. 10 MiB holds a 24 MP JPEG of a phone.
-    max_pixels
-        Width times height as the header states them. 24 million holds the photos of common
-        phones; what a picture takes in memory is in docs/models.md.
-    max_side
-        Longer side in pixels.
-    max_scans
-        Scans of a JPEG of ``max_pixels``; a smaller one may have more in proportion. Each scan of a
-        progressive JPEG walks over the whole picture, whatever few bytes it has: 90 over 24 MP
-        in a file of 146 kB take nine times the work of decoding an ordinary photo of that size.
-    """
-
-    max_bytes: int = 10 * 2**20
-    max_pixels: int = 24_000_000
+    max_bytes: int = 10 * 2**20  # a 24 MP JPEG of a phone
+    max_pixels: int = 24_000_000  # as the header states them
     max_side: int = 16_384
+    # Of a JPEG of `max_pixels`; a smaller one may have more in proportion. Each scan walks over the
+    # whole picture, whatever few bytes it has: 90 over 24 MP in a file of 146 kB take nine times
+    # the work of decoding an ordinary photo of that size.
     max_scans: int = 18
 
 

@@ -28,15 +28,7 @@ class ModelError(Exception):
 
 
 class ImageError(ModelError):
-    """Bytes that are no picture Veilface reads, or a picture over a limit.
-
-    Parameters
-    ----------
-    code
-        ``unsupported_image`` or ``image_too_large``.
-    message
-        A sentence for the person who sent the picture.
-    """
+    """Bytes that are no picture Veilface reads, or a picture over a limit."""
 
     def __init__(self, code: ImageCode, message: str) -> None:
         super().__init__(message)
@@ -58,12 +50,8 @@ class CacheError(ModelError):
 class FaceError(ModelError):
     """A picture that was decoded, in which no usable face was found.
 
-    Attributes
-    ----------
-    code
-        Machine-readable name, the same as in the REST contract.
-    details
-        Measured values and limits, keyed by what was measured.
+    ``code`` is that of the REST contract; ``details`` has measured values and limits, by what was
+    measured.
     """
 
     code = "no_face"
@@ -105,12 +93,7 @@ class LowQuality(FaceError):
 class PhotoRejected(ModelError):
     """One photo of a set was refused, and the set with it.
 
-    Parameters
-    ----------
-    index
-        Position of the photo in the set, from 0. Words count from 1.
-    cause
-        What was wrong with it; it has its own code and message.
+    ``index`` counts from 0, words from 1; ``cause`` has a code and a message of its own.
     """
 
     def __init__(self, index: int, cause: ModelError, *, count: int) -> None:

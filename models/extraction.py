@@ -56,23 +56,11 @@ class Failure:
 
 @dataclass(frozen=True, eq=False)
 class Extraction:
-    """Result of one bulk run.
+    """Result of one bulk run."""
 
-    Attributes
-    ----------
-    embeddings
-        float32, shape (k, n), unit rows, in the order of ``paths``. Never shown by ``repr``.
-    paths
-        The k files that were embedded, in the order in which they were given.
-    failures
-        All others, in the order in which they were given.
-    mirrored
-        The embeddings with the mirror image added, where they were asked for.
-    """
-
-    embeddings: NDArray[np.float32] = field(repr=False)
-    paths: list[Path]
-    failures: list[Failure]
+    embeddings: NDArray[np.float32] = field(repr=False)  # (k, n) unit rows, in the order of `paths`
+    paths: list[Path]  # that were embedded, in the order in which they were given
+    failures: list[Failure]  # all others
     cached: int
     mirrored: NDArray[np.float32] | None = field(default=None, repr=False)
 

@@ -24,29 +24,13 @@ _HEIGHT = float(np.hypot(*(TEMPLATE_112[3] + TEMPLATE_112[4] - TEMPLATE_112[:2].
 
 @dataclass(frozen=True)
 class HeadPose:
-    """Pose of one head in one picture.
+    """Pose of one head in one picture."""
 
-    Attributes
-    ----------
-    yaw
-        Degrees; positive when the nose points to the right of the picture, which is a turn to the
-        person's left where the picture is not mirrored.
-    pitch
-        Degrees; positive when the face looks down.
-    roll
-        Degrees; positive when the head is turned clockwise in the picture.
-    scale
-        Size of the head in the picture over that of the 112-pixel template. Turning the head does
-        not change it.
-    centre
-        x and y of the middle of the five points, in pixels.
-    """
-
-    yaw: float
-    pitch: float
-    roll: float
-    scale: float
-    centre: tuple[float, float]
+    yaw: float  # degrees; positive when the nose points to the right of the picture
+    pitch: float  # degrees; positive when the face looks down
+    roll: float  # degrees; positive when the head is turned clockwise in the picture
+    scale: float  # of the head over that of the 112-pixel template; turning does not change it
+    centre: tuple[float, float]  # x and y of the middle of the five points, in pixels
 
 
 def head_pose(keypoints: NDArray[np.floating]) -> HeadPose:

@@ -36,33 +36,17 @@ _SCALE_IN_NAME = re.compile(r"(?:^|[_-])(\d(?:\.\d+)?)(?:_0_0)?_80x80(?![0-9x])"
 
 @dataclass(frozen=True, kw_only=True)
 class LivenessInput:
-    """What a liveness graph is fed, and how its output is read.
+    """What a liveness graph is fed, and how its output is read."""
 
-    Parameters
-    ----------
-    crop_scale
-        Sides of the crop over those of the face's box.
-    crop
-        ``box`` keeps the box's shape, is limited to the frame's size and moved into it; ``square``
-        has the longer side, and mirrors the frame where it reaches over the border.
-    size
-        Side of the square input in pixels.
-    channel_order
-        ``rgb`` or ``bgr``.
-    input_range
-        What the pixel values 0 and 255 become.
-    live_class
-        Place of the live class among the outputs, from 0.
-    score
-        ``softmax``: share of the live class, 0…1. ``difference``: of two logits, live less attack.
-    """
-
-    crop_scale: float
+    crop_scale: float  # sides of the crop over those of the face's box
+    # box keeps the box's shape, is limited to the frame's size and moved into it; square has the
+    # longer side, and mirrors the frame where it reaches over the border.
     crop: CropShape
-    size: int
-    channel_order: str
-    input_range: tuple[float, float]
-    live_class: int
+    size: int  # side of the square input in pixels
+    channel_order: str  # rgb or bgr
+    input_range: tuple[float, float]  # what the pixel values 0 and 255 become
+    live_class: int  # place among the outputs, from 0
+    # softmax: share of the live class, 0…1; difference: of two logits, live less attack.
     score: ScoreKind
 
 
@@ -157,19 +141,9 @@ class PassiveLiveness:
         return tuple(sorted(graph.graph_id for graph in self.members))
 
     def score(self, picture: NDArray[np.uint8], box: Box) -> float:
-        """Return how live a face looks; higher is more live.
+        """Return how live the face in a box of the whole upright frame looks; higher is more live.
 
-        Parameters
-        ----------
-        picture
-            The whole upright frame, RGB uint8, shape (h, w, 3).
-        box
-            Of the face: x1, y1, x2, y2 in pixels. May reach over the border.
-
-        Returns
-        -------
-        float
-            Mean over the graphs: in 0…1, or a difference of logits.
+        The mean over the graphs: in 0…1, or a difference of logits.
         """
         return sum(graph.score(picture, box) for graph in self.members) / len(self.members)
 

@@ -38,47 +38,24 @@ class DetectorInfo:
 
 @dataclass(frozen=True)
 class PackInfo:
-    """What identifies a pack.
-
-    Attributes
-    ----------
-    preprocessing
-        JSON-able; with the embedder's hash it decides whether embeddings are comparable.
-    detector
-        ``None`` where the pack takes aligned crops only.
-    """
+    """What identifies a pack."""
 
     name: str
     n: int
     embedder_file: str
     embedder_sha256: str
-    preprocessing: dict[str, Any]
-    detector: DetectorInfo | None
+    preprocessing: dict[str, Any]  # with the hash it decides whether embeddings are comparable
+    detector: DetectorInfo | None  # None where the pack takes aligned crops only
 
 
 class PhotoOptions(TypedDict, total=False):
-    """How a photo becomes a face.
+    """How a photo becomes a face."""
 
-    Attributes
-    ----------
-    policy
-        Which of several faces is meant; ``None`` takes the most central one
-        (`selection.select_face`).
-    quality
-        Limits; ``None`` checks nothing but that there is an upright face.
-    limits
-        What decoding may cost.
-    liveness
-        Also say how live the face looks; the pack needs a liveness graph.
-    digested
-        Also give the digest of the decoded photo.
-    """
-
-    policy: FacePolicy | None
-    quality: QualityLimits | None
-    limits: ImageLimits
-    liveness: bool
-    digested: bool
+    policy: FacePolicy | None  # which of several faces is meant; None: the most central one
+    quality: QualityLimits | None  # None checks nothing but that there is an upright face
+    limits: ImageLimits  # what decoding may cost
+    liveness: bool  # also say how live the face looks; the pack needs a liveness graph
+    digested: bool  # also give the digest of the decoded photo
 
 
 class ModelPack:

@@ -31,40 +31,20 @@ _NEUTRAL_NOSE = 0.545
 
 @dataclass(frozen=True, kw_only=True)
 class Quality:
-    """What was measured on one face.
+    """What was measured on one face; None where it came aligned, and nothing was detected."""
 
-    Attributes
-    ----------
-    score
-        Confidence of the detector, 0...1; ``None`` for crops that came aligned.
-    face_size
-        Shorter side of the detected box in pixels; ``None`` for crops that came aligned.
-    sharpness
-        Fine detail of the aligned crop, see `measure_sharpness`; no unit, about 3 for a sharp
-        photo, below 0.5 for one that is useless.
-    brightness
-        Mean luma of the centre of the aligned crop, 0...255.
-    exposure
-        Luma that a twentieth of the whole picture exceeds, 0...255. It does not depend on skin.
-    yaw, pitch, roll
-        Degrees, see `measure_pose`; ``None`` for crops that came aligned.
-    border
-        Least distance of the five points from the border of the picture, as a share of the aligned
-        crop's side; negative where a point lies outside; ``None`` for crops that came aligned.
-    aspect
-        Height of the detected box over its width; ``None`` for crops that came aligned.
-    """
-
-    score: float | None
-    face_size: float | None
-    sharpness: float
-    brightness: float
-    exposure: float
-    yaw: float | None
+    score: float | None  # confidence of the detector, 0...1
+    face_size: float | None  # shorter side of the box in pixels
+    sharpness: float  # `measure_sharpness`: about 3 for a sharp photo, below 0.5 useless
+    brightness: float  # mean luma of the centre of the aligned crop, 0...255
+    exposure: float  # luma that a twentieth of the whole picture exceeds: it knows no skin
+    yaw: float | None  # degrees, see `measure_pose`
     pitch: float | None
     roll: float | None
+    # Least distance of the five points from the border of the picture, as a share of the crop's
+    # side; negative where a point lies outside.
     border: float | None
-    aspect: float | None
+    aspect: float | None  # height of the box over its width
 
     def as_dict(self) -> dict[str, float | None]:
         """JSON-able form."""
@@ -73,31 +53,17 @@ class Quality:
 
 @dataclass(frozen=True, kw_only=True)
 class QualityLimits:
-    """What a face must reach. How the defaults were measured: docs/results/photos.md.
+    """What a face must reach. How the defaults were measured: docs/results/photos.md."""
 
-    Attributes
-    ----------
-    min_score
-        Detector confidence; ``None`` takes the detector's own recommendation, since detectors
-        differ in what a value means.
-    min_face_size
-        Shorter side of the box in pixels. A smaller face does not count as a further one either.
-    min_sharpness, min_brightness, max_brightness, min_exposure
-        As in `Quality`. In an underexposed picture strangers look alike; a face that is dark in a
-        bright one is recognised down to a far lower luma.
-    max_yaw, max_pitch, max_roll
-        Absolute degrees.
-    min_border, max_aspect
-        As in `Quality`: whether part of the face is covered, or lies outside the picture.
-    """
-
-    min_score: float | None = None
-    min_face_size: float = 24.0
+    min_score: float | None = None  # the detector's recommendation: detectors differ
+    min_face_size: float = 24.0  # a smaller face does not count as a further one either
     min_sharpness: float = 0.5
+    # In an underexposed picture strangers look alike; a face that is dark in a bright one is
+    # recognised down to a far lower luma.
     min_brightness: float = 6.0
     max_brightness: float = 235.0
     min_exposure: float = 40.0
-    max_yaw: float = 70.0
+    max_yaw: float = 70.0  # absolute degrees, as the next two
     max_pitch: float = 55.0
     max_roll: float = 45.0
     min_border: float = 0.08

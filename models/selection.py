@@ -13,23 +13,14 @@ LARGER = 1.25
 
 
 class FacePolicy(StrEnum):
-    """What a photo with several faces means.
-
-    Attributes
-    ----------
-    DOMINANT
-        The largest face, where it covers the middle of the picture and has at least `DOMINANCE`
-        times the area of every other face.
-    LARGEST
-        The largest face, wherever it is, where it has at least `LARGER` times the area of every
-        other: which of two equal faces is the larger one, a hair decides.
-    SINGLE
-        None of them: a second face refuses the photo.
-    """
+    """What a photo with several faces means."""
 
     DOMINANT = "dominant"
+    """The largest face, in the middle of the picture and ``DOMINANCE`` times any other's area."""
     LARGEST = "largest"
+    """The largest face, wherever it is, of ``LARGER`` times any other's area: not by a hair."""
     SINGLE = "single"
+    """None of them: a second face refuses the photo."""
 
 
 def select_face(

@@ -68,22 +68,9 @@ class Tensor:
 class Session:
     """One ONNX graph, loaded once, that any number of threads may run.
 
-    Parameters
-    ----------
-    model
-        Serialised ONNX bytes. They are what was hashed, so the hash is of what runs.
-    name
-        File name for error messages.
-    providers
-        Short (``cpu``, ``cuda``) or full onnxruntime names, best first. Each must be present and
-        be in use after loading; nothing falls back silently.
-    threads
-        Threads inside one operator; ``None`` leaves the choice to onnxruntime (all cores).
-
-    Attributes
-    ----------
-    inputs, outputs
-        As onnxruntime describes them; ``inputs`` is empty where one is not of float32.
+    ``model`` is serialised ONNX: what was hashed is what runs. ``providers`` are short (``cpu``) or
+    full onnxruntime names, best first; each must be in use after loading, and nothing falls back
+    silently. ``inputs`` is empty where one is not of float32.
     """
 
     def __init__(
@@ -106,13 +93,7 @@ class Session:
     def run(
         self, feeds: Mapping[str, NDArray[np.float32]], outputs: Sequence[str] | None = None
     ) -> list[NDArray[np.float32]]:
-        """Run the graph; safe from several threads at once.
-
-        Parameters
-        ----------
-        outputs
-            Names of the wanted outputs, in order; all where absent.
-        """
+        """Run the graph; safe from several threads at once."""
         try:
             results = self._loaded.run(list(outputs) if outputs else None, dict(feeds))
         except Exception as error:
