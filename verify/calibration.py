@@ -54,19 +54,19 @@ def part_of(progress: Progress, first: float, last: float) -> Progress:
 
 
 def calibrate(
-    embeddings: NDArray[np.floating],
+    embeddings: NDArray[np.floating],  # (N, n) unit rows
     identities: Sequence[str],
     *,
     binding: Binding,
     source: DecoySource,
     options: CalibrationOptions | None = None,
     exclude: Collection[str] = (),
-    labels: PhotoLabels | None = None,
-    pairs: Sequence[Pair] | None = None,
-    cohort_seed: bytes | None = None,
-    recorded: Mapping[str, Json] | None = None,
+    labels: PhotoLabels | None = None,  # of every embedding, for rates by group of people
+    pairs: Sequence[Pair] | None = None,  # of the ten-fold protocol; random ones by default
+    cohort_seed: bytes | None = None,  # a contract's, to keep its cohort
+    recorded: Mapping[str, Json] | None = None,  # facts for the contract file
     dataset: str = "labelled folder",
-    progress: Progress = lambda _what, _share: None,
+    progress: Progress = lambda _what, _share: None,  # of the whole, from 0 to 1
 ) -> Calibrated:
     """Calibrate a contract on the private templates of labelled people.
 
@@ -75,22 +75,6 @@ def calibrate(
     probes are the photos that were left out. Impostor trials are all cross-identity pairs or a
     random subset of them, as the contract states. A level's threshold is the smallest score at
     which the FMR is at most the target (docs/method.md "Scores").
-
-    Parameters
-    ----------
-    embeddings : (N, n) floating
-        Unit rows.
-    labels
-        Of every embedding, for rates by group of people; none without them.
-    pairs
-        Pairs of the ten-fold protocol, as positions in ``embeddings``; balanced random pairs
-        where None. Pairs of excluded people are left out.
-    cohort_seed
-        A contract's, to keep its cohort; by default a new one is drawn.
-    recorded
-        Facts for the contract file, such as the pack's name and detector.
-    progress
-        Called with what is being done and the share of the whole, which rises from 0 to 1.
 
     Raises
     ------

@@ -53,52 +53,25 @@ STEPS = 20
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrationOptions:
-    """How to calibrate.
+    """How to calibrate."""
 
-    Parameters
-    ----------
-    protocol
-        ``fmr`` sets levels by target FMR; ``ten-fold`` adds the level ``accuracy``.
-    probe_dims
-        Dimensions of the probes: 0 for raw ones, others for lifted ones.
-    probe_photos
-        Numbers of photos that raw probes are the means of; those beyond 1 are calibrated where
-        ``least_people`` have as many photos left over after the enrollment.
-    photos_per_enrollment
-        Most photos averaged into one template.
-    targets
-        FMR targets, powers of ten; those that the data cannot resolve are left out and reported.
-    most_templates
-        Most people whose templates are compared with; the others only probe. All where people are
-        labelled.
-    most_cells
-        Most p-to-s comparisons: FMR 1e-6 is resolved by 10 million. An eighth of it for probes of
-        several photos; FMR 1e-5 is resolved by a million, of 300,000 pairs of people: 125 people
-        with so many photos and ``most_templates`` others. ``GROUPED`` times as many where people
-        are labelled.
-    lifted_probes, lifted_impostor_pairs
-        Size of the random subset of s-to-s comparisons, for each probe dimension.
-    worst_group
-        Set every threshold of ``fmr`` so that no group of people with trials enough to set it by
-        exceeds the target either; needs labels.
-    seed
-        Seed of every random choice but the strangers' and the cohort's.
-    """
-
-    protocol: Protocol = "fmr"
+    protocol: Protocol = "fmr"  # ten-fold adds the level `accuracy`
     metric: Metric = Metric.SPHERICAL
     steps: int = STEPS
-    probe_dims: tuple[int, ...] = (0,)
+    probe_dims: tuple[int, ...] = (0,)  # 0 for raw probes, others for lifted ones
+    # Photos that raw probes are the means of; beyond 1 where `least_people` have as many left over.
     probe_photos: tuple[int, ...] = (1, 2, 3, 5)
     least_people: int = 50
-    targets: tuple[float, ...] = TARGETS
-    photos_per_enrollment: int = 3
-    most_templates: int = 2_400
+    targets: tuple[float, ...] = TARGETS  # powers of ten; those unresolved are reported
+    photos_per_enrollment: int = 3  # at most
+    most_templates: int = 2_400  # people whose templates are compared with; all where labelled
+    # P-to-s comparisons at most: FMR 1e-6 is resolved by 10 million. An eighth of it for probes of
+    # several photos, and `GROUPED` times as many where people are labelled.
     most_cells: int = 12_000_000
-    lifted_probes: int = 2_000
+    lifted_probes: int = 2_000  # size of the random subset of s-to-s, for each dimension
     lifted_impostor_pairs: int = 300_000
-    worst_group: bool = False
-    seed: int = 0
+    worst_group: bool = False  # no group with trials enough exceeds a target either; needs labels
+    seed: int = 0  # of every random choice but the strangers' and the cohort's
 
     def __post_init__(self) -> None:
         for target in self.targets:

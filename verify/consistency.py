@@ -38,25 +38,12 @@ MOST_PAIRS = 50
 
 @dataclass(frozen=True)
 class Consistency:
-    """The limit, and what it does on the photos it was set on.
+    """The limit, and what it does on the photos it was set on."""
 
-    Parameters
-    ----------
-    threshold
-        Least agreement of the photos of one enrollment (``templates.space.agreement``); for two
-        photos, their raw cosine.
-    probe_threshold
-        Least agreement of the photos of one probe.
-    fmr
-        Of pairs of photos of different people, how many reach it.
-    refused
-        Of genuine sets of photos, how many it refuses.
-    """
-
-    threshold: float
+    threshold: float  # least agreement of the photos of one enrollment (`templates.space`)
     probe_threshold: float
-    fmr: Rate
-    refused: Rate
+    fmr: Rate  # pairs of photos of different people that reach it
+    refused: Rate  # genuine sets of photos that do not
 
 
 def photo_consistency(

@@ -16,44 +16,23 @@ _UNCOVER = (
 
 @dataclass(frozen=True)
 class Decision:
-    """Accept or reject, and by which threshold.
-
-    Parameters
-    ----------
-    reason
-        ``match`` or ``no_match``; a subject that does not exist is also ``no_match``. ``liveness``
-        where the probe is not taken for a living person's, whether it matches or not.
-    fmr
-        The level's target FMR; for a level without a target, the FMR seen in calibration.
-    contract_id, calibration_id
-        What the threshold belongs to.
-    similarity, distance, score
-        For keys with the right to them: returned to anyone else they let an attacker
-        climb (docs/method.md §4.8). Left out of ``repr``, so that no log line holds them by
-        accident.
-    distance_threshold
-        The distance at which this probe would just be accepted; the threshold itself is a score.
-    liveness
-        Whether a living person made the probe, where that was checked.
-    liveness_failure
-        Why not; for keys with the right to scores, like these.
-    advice
-        What to change in another photo, by this photo alone; only where it does not match.
-    """
+    """Accept or reject, and by which threshold."""
 
     accepted: bool
-    reason: Reason
+    reason: Reason  # no_match also of a subject that does not exist; liveness, match or not
     level: str
-    fmr: float
+    fmr: float  # the level's target; the FMR seen in calibration where it has none
     contract_id: str
     calibration_id: str
+    # For keys with the right to them: with them an attacker climbs (docs/method.md §4.8). Left out
+    # of `repr`, so that no log line holds them by accident.
     similarity: float = field(repr=False)
     distance: float = field(repr=False)
     score: float = field(repr=False)
-    distance_threshold: float = field(repr=False)
+    distance_threshold: float = field(repr=False)  # at which this probe would just be accepted
     liveness: Liveness = "not_checked"
-    liveness_failure: LivenessFailure | None = None
-    advice: str | None = None
+    liveness_failure: LivenessFailure | None = None  # for keys with the right to scores, too
+    advice: str | None = None  # on another photo, by this photo alone; where it does not match
 
     def with_advice(self, *, clear: bool) -> "Decision":
         """Return the decision on a photo of a face that is `clear`, or seems to be covered.
@@ -77,18 +56,8 @@ class Decision:
 
 @dataclass(frozen=True)
 class StandIn:
-    """A template of nobody, which no probe is accepted for; decided on as any other.
-
-    Attributes
-    ----------
-    wire
-        Its wire bytes.
-    template_id
-        Any, as long as a real one: a rotation is derived from it, as from a real one.
-    holder_salt
-        None: no key would be the holder's.
-    """
+    """A template of nobody, which no probe is accepted for; decided on as any other."""
 
     wire: bytes = field(repr=False)
-    template_id: str = "0" * 32
+    template_id: str = "0" * 32  # a rotation is derived from it, as from a real one
     holder_salt: str | None = None

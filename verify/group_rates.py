@@ -42,19 +42,11 @@ class PhotoLabels:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PeopleGroups:
-    """The people of a calibration by one attribute.
-
-    Parameters
-    ----------
-    names
-        Its groups; ages in the order of years.
-    of : (people,) int64
-        Number of each person's group; -1 where they have none.
-    """
+    """The people of a calibration by one attribute."""
 
     attribute: str
-    names: tuple[str, ...]
-    of: Indices
+    names: tuple[str, ...]  # of its groups; ages in the order of years
+    of: Indices  # (people,) number of each person's group; -1 where they have none
 
     def shared(self, pairs: Indices) -> Indices:
         """Number of the group that both people of (E, 2) pairs are in; -1 where there is none."""

@@ -62,17 +62,8 @@ def threshold_at_fmr(impostor: ArrayLike, target: float, *, trials: int | None =
     """Lowest threshold whose FMR on these impostors is at most the target, never the nearest.
 
     The threshold lies halfway between the last similarity that it accepts and the first that it
-    rejects; above all of them where the target allows no error.
-
-    Parameters
-    ----------
-    impostor
-        Similarities of the impostor trials.
-    target
-        False match rate.
-    trials
-        Number of trials, where ``impostor`` holds only their highest similarities, more of them
-        than the target allows errors.
+    rejects; above all of them where the target allows no error. ``trials`` counts them where
+    ``impostor`` holds only the highest similarities, more of them than the target allows errors.
     """
     scores = np.sort(np.asarray(impostor, dtype=np.float64).ravel())[::-1]
     if scores.size == 0 or not 0.0 <= target <= 1.0:

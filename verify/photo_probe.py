@@ -47,24 +47,12 @@ MOVING_SHARPNESS = 0.4
 
 @dataclass(frozen=True, eq=False)
 class PhotoProbe:
-    """What photos or frames come to.
+    """What photos or frames come to."""
 
-    Attributes
-    ----------
-    embedding
-        Mean of the photos, of frames of those that look ahead, (n,) float32, unit norm.
-    photos
-        How many these are; one that was given twice counts once.
-    failure
-        Why they are not taken for a living person's; None where nothing speaks against it.
-    clear
-        Whether nothing seems to cover the face in any of them.
-    """
-
-    embedding: NDArray[np.float32] = field(repr=False)
-    photos: int
-    failure: LivenessFailure | None
-    clear: bool
+    embedding: NDArray[np.float32] = field(repr=False)  # (n,) unit mean; of frames that look ahead
+    photos: int  # how many these are; one that was given twice counts once
+    failure: LivenessFailure | None  # why they are not taken for a living person's
+    clear: bool  # nothing seems to cover the face in any of them
 
 
 def probe_of_photos(
@@ -117,11 +105,6 @@ def probe_of_frames(
     The first frames that look ahead are averaged; every frame must show the same person, by the
     limit for photos of one probe. A failure is no error: the probe is compared all the same, so
     that both take the same time.
-
-    Parameters
-    ----------
-    passive
-        Whether the frames that are averaged must look live too.
 
     Raises
     ------

@@ -17,28 +17,13 @@ GROUP = 50
 
 @dataclass(frozen=True, eq=False, repr=False)
 class TrialPlan:
-    """One enrollment per person, and which photos probe it.
+    """One enrollment per person, and which photos probe it."""
 
-    Parameters
-    ----------
-    people
-        Names, in the order of their indices.
-    person_of : (N,) int64
-        Person of every photo.
-    enrolled
-        For every person, the photos that are averaged into the one template.
-    compared : (T,) int64
-        People whose templates are made and compared with, in rising order; all others only probe.
-    genuine : (G,) int64
-        Photos that are not enrolled, of people who are compared: the genuine probes. Nobody's own
-        enrollment photo is ever a genuine probe.
-    """
-
-    people: tuple[str, ...]
-    person_of: Indices
-    enrolled: tuple[Indices, ...]
-    compared: Indices
-    genuine: Indices
+    people: tuple[str, ...]  # in the order of their indices
+    person_of: Indices  # (N,) person of every photo
+    enrolled: tuple[Indices, ...]  # for every person, the photos that make the one template
+    compared: Indices  # (T,) people whose templates are compared with, rising; others only probe
+    genuine: Indices  # (G,) genuine probes: photos of people who are compared, never enrolled ones
 
     @cached_property
     def template_of(self) -> Indices:
