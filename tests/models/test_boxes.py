@@ -1,13 +1,10 @@
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from models.boxes import (
     MAX_CANDIDATES,
     Face,
-    centre_rank,
-    intersection_over_union,
     non_maximum_suppression,
     ranked,
 )
@@ -34,12 +31,6 @@ box = st.tuples(*[st.integers(0, 60)] * 2, *[st.integers(1, 40)] * 2).map(
 )
 
 
-@given(box, box)
-def test_intersection_over_union_of_two(a, b):
-    value = intersection_over_union(np.array(a, np.float32), np.array(b, np.float32))
-    assert value == pytest.approx(overlap(a, b))
-
-
 @settings(max_examples=60)
 @given(
     st.lists(st.tuples(box, st.integers(1, 6)), min_size=1, max_size=25),
@@ -50,13 +41,6 @@ def test_equals_greedy_suppression_by_hand(items, threshold):
     scores = np.array([s for _, s in items], dtype=np.float32)
     kept = non_maximum_suppression(boxes, scores, threshold=threshold)
     assert kept.tolist() == brute_force(boxes.astype(float), scores, threshold)
-
-
-def test_nothing_in_nothing_out():
-    kept = non_maximum_suppression(
-        np.empty((0, 4), np.float32), np.empty(0, np.float32), threshold=0.4
-    )
-    assert kept.shape == (0,)
 
 
 def test_a_flood_of_candidates_is_cut_to_the_best():
@@ -71,10 +55,6 @@ def test_a_flood_of_candidates_is_cut_to_the_best():
 
 def face(x1, y1, x2, y2, score=0.9) -> Face:
     return Face(np.array([x1, y1, x2, y2], np.float32), score, np.zeros((5, 2), np.float32))
-
-
-def test_rank_is_area_less_twice_the_squared_distance():
-    assert centre_rank(face(10, 20, 50, 80), (100, 200, 3)) == 40 * 60 - 2 * ((30 - 100) ** 2 + 0)
 
 
 def test_a_central_face_comes_before_a_larger_one_in_the_corner():

@@ -72,13 +72,6 @@ def test_a_failed_write_keeps_the_old_file_and_leaves_nothing_behind(tmp_path, m
     assert len(list(tmp_path.iterdir())) == 1
 
 
-def test_what_the_sealer_refuses_passes_through(tmp_path):
-    path = tmp_path / "embeddings.cache"
-    path.write_bytes(b"something else")
-    with pytest.raises(ValueError, match="wrong context"):
-        EmbeddingCache.open_file(path, Xor())
-
-
 def npz(**arrays: np.ndarray) -> bytes:
     file = io.BytesIO()
     np.savez(file, **arrays)
@@ -105,9 +98,3 @@ def test_opened_content_is_checked(tmp_path, content):
     path.write_bytes(Xor().seal(content, context=CONTEXT))
     with pytest.raises(CacheError, match="delete it"):
         EmbeddingCache.open_file(path, Xor())
-
-
-def test_repr_shows_no_numbers():
-    cache = EmbeddingCache()
-    cache.put(b"k" * 32, vector(1))
-    assert repr(cache) == "EmbeddingCache(1 entries)"

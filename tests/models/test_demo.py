@@ -5,17 +5,13 @@ from collections.abc import Iterator
 
 import cv2
 import numpy as np
-import onnx
 import onnxruntime as ort
 import pytest
 
 from models.demo import (
-    DEMO_DIMENSION,
-    DEMO_NOTICE,
     build_demo_pack,
     demo_model_bytes,
     demo_model_sha256,
-    is_demo_model,
     require_face,
 )
 from models.errors import NoFace
@@ -38,18 +34,6 @@ def session() -> ort.InferenceSession:
 @pytest.fixture(scope="module")
 def faces() -> np.ndarray:
     return draw_people(range(PEOPLE), range(PHOTOS))
-
-
-def test_the_signature_routes_as_an_embedder():
-    model = onnx.load_from_string(demo_model_bytes())
-    onnx.checker.check_model(model, full_check=True)
-    graph = model.graph
-    (given,) = graph.input
-    (made,) = graph.output
-    assert [d.dim_value for d in given.type.tensor_type.shape.dim][1:] == [3, 112, 112]
-    assert [d.dim_value for d in made.type.tensor_type.shape.dim][1:] == [DEMO_DIMENSION]
-    # Subtraction and scaling together in the first eight nodes would mean 0..255 input.
-    assert "Sub" not in [node.op_type for node in graph.node[:8]]
 
 
 def pacman(mouth: float, size: int = 720) -> np.ndarray:
@@ -99,15 +83,6 @@ def test_the_file_is_the_same_in_another_process():
         [sys.executable, "-c", program], capture_output=True, text=True, check=True
     ).stdout.strip()
     assert seen == hashlib.sha256(demo_model_bytes()).hexdigest() == demo_model_sha256()
-
-
-def test_the_pack_says_what_it_is(tmp_path):
-    folder = build_demo_pack(tmp_path / "new" / "pack")
-    assert [f.name for f in folder.iterdir()] == ["demo.onnx"]
-    written = (folder / "demo.onnx").read_bytes()
-    assert onnx.load_from_string(written).doc_string == DEMO_NOTICE
-    assert is_demo_model(hashlib.sha256(written).hexdigest())
-    assert not is_demo_model(hashlib.sha256(b"another model").hexdigest())
 
 
 def test_embeddings_separate_drawn_people(session, faces):

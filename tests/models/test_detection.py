@@ -34,22 +34,6 @@ class Replay:
         return self.answer(blob, outputs)
 
 
-def test_letterbox_keeps_the_aspect_ratio_in_the_top_left_corner():
-    image = np.full((50, 100, 3), 200, np.uint8)
-    canvas, scale = letterbox(image, (64, 64), enlarge=True)
-    assert scale == pytest.approx(0.64)
-    assert (canvas[:32] == 200).all()
-    assert (canvas[32:] == 0).all()
-
-
-def test_letterbox_does_not_enlarge_unless_told():
-    image = np.full((10, 20, 3), 9, np.uint8)
-    canvas, scale = letterbox(image, (64, 64), enlarge=False)
-    assert scale == 1.0
-    np.testing.assert_array_equal(canvas[:10, :20], image)
-    assert letterbox(image, (64, 64), enlarge=True)[1] == pytest.approx(3.2)
-
-
 @pytest.mark.parametrize("enlarge", [True, False])
 @pytest.mark.parametrize(
     ("shape", "filled", "scale"),
@@ -167,12 +151,6 @@ def test_yunet_decodes_centres_and_log_sides():
     )
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (250, 250), (40, 4000), (3000, 2000), (641, 640)])
-def test_yunet_canvas_is_whole_blocks_and_bounded(shape):
-    size = YuNet(Replay(None)).canvas(np.zeros((*shape, 3), np.uint8), (640, 640))
-    assert all(side % 32 == 0 and 32 <= side <= 640 for side in size)
-
-
 class Sight:
     """Sees faces, given as shares of the picture, of 8 to 450 pixels on the canvas; and blobs.
 
@@ -228,12 +206,6 @@ def test_a_face_that_fills_the_picture_is_found_whatever_else_is(shape, blobs):
     detector = Sight(TIGHT, blobs=blobs)
     faces = find_faces(detector, np.zeros((*shape, 3), np.uint8))
     assert boxes_of(faces, shape) == [TIGHT]
-
-
-@pytest.mark.parametrize("shape", [(800, 800), (4000, 3000)])
-def test_a_small_face_beside_one_that_fills_the_picture_is_found(shape):
-    faces = find_faces(Sight(TIGHT, FAR, blobs=(EAR,)), np.zeros((*shape, 3), np.uint8))
-    assert boxes_of(faces, shape) == [TIGHT, FAR]
 
 
 def test_a_face_that_both_canvases_show_counts_once():
@@ -301,10 +273,6 @@ def test_looks_again_near_and_then_in_a_border(wanted, shape):
         assert share[1].mean() == pytest.approx(0.8 / 1.8, abs=0.03)
     # The middle of the picture, however it was looked at.
     np.testing.assert_allclose(face.keypoints[0], [shape[1] / 2, shape[0] / 2], atol=1)
-
-
-def test_nothing_found_is_an_empty_list():
-    assert find_faces(Picky(99), np.zeros((30, 30, 3), np.uint8)) == []
 
 
 @pytest.mark.parametrize("name", ["w600k_mbf", "yunet_mobilefacenet128"])

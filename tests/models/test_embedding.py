@@ -46,10 +46,6 @@ def test_flip_adds_the_raw_embedding_of_the_mirror_before_normalising():
     np.testing.assert_allclose(POOLING.embed(pictures, flip=True), expected, atol=2e-5)
 
 
-def test_no_crops_give_no_rows():
-    assert POOLING.embed(crops(0), flip=True).shape == (0, POOLING.n)
-
-
 def test_a_fixed_batch_is_filled_up():
     fixed = embedder(pooling_embedder(batch=4))
     pictures = crops(6)
@@ -86,17 +82,3 @@ def test_normalisation_inside_real_graphs(shared_data):
 def test_a_zero_or_endless_output_is_an_error(factor):
     with pytest.raises(ModelError, match=r"pooling\.onnx"):
         embedder(pooling_embedder(factor=factor)).embed(crops(1), flip=False)
-
-
-def test_a_crop_that_gives_zero_is_an_error():
-    grey = np.full((1, 112, 112, 3), 100, np.uint8)
-    with pytest.raises(ModelError, match="zero or not finite"):
-        embedder(mean=(100,) * 3).embed(grey, flip=False)
-
-
-@pytest.mark.parametrize(
-    "bad", [crops(1)[0], crops(1, size=96), crops(1).astype(np.float32), crops(1)[..., :1]]
-)
-def test_other_shapes_and_types_are_refused(bad):
-    with pytest.raises(ModelError, match=r"uint8 of shape \(B, 112, 112, 3\)"):
-        POOLING.embed(bad, flip=False)

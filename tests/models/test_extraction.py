@@ -6,7 +6,7 @@ from PIL import Image
 
 from models import extraction
 from models.cache import EmbeddingCache
-from models.extraction import Extractor, Photo
+from models.extraction import Extractor
 from models.pack import ModelPack
 from tests.models.graphs import pooled, pooling_embedder, unit, write_pack
 
@@ -115,11 +115,6 @@ def test_the_cache_file_is_written_even_when_inference_breaks(pack, files, monke
     assert flushed == [True]
 
 
-def test_repr_shows_no_numbers(pack, files):
-    result = Extractor(pack).extract(files[:1])
-    assert "embeddings" not in repr(result)
-
-
 # -- real models and real faces ----------------------------------------------------------------
 
 
@@ -149,12 +144,3 @@ def test_both_kinds_at_once_are_those_of_two_packs(tmp_path, files, monkeypatch)
     with pytest.raises(ValueError, match="adds the mirror image already"):
         Extractor(flipped, mirrored=True)
     assert Extractor(plain).extract(files).mirrored is None
-
-
-def test_encoded_photos_stand_under_their_names(pack, files):
-    photos = [Photo(f"{i:03d}", path.read_bytes()) for i, path in enumerate(files)]
-    result = Extractor(pack).extract([*photos, Photo("bad", b"x")])
-    assert [str(path) for path in result.paths] == [photo.name for photo in photos]
-    assert [(str(f.path), f.code) for f in result.failures] == [("bad", "unsupported_image")]
-    np.testing.assert_array_equal(result.embeddings, Extractor(pack).extract(files).embeddings)
-    assert "source" not in repr(photos[0])

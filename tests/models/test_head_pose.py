@@ -61,23 +61,6 @@ def test_scale_follows_size_and_not_the_turn(yaw: float, pitch: float, factor: f
     assert head_pose(far * factor).scale == pytest.approx(factor * head_pose(far).scale)
 
 
-def test_half_the_distance_is_twice_the_scale() -> None:
-    near, far = head_pose(head(distance=400.0)), head_pose(head(distance=800.0))
-    assert near.scale / far.scale == pytest.approx(2, rel=0.01)
-
-
-def test_the_centre_moves_with_the_head() -> None:
-    first, moved = head_pose(head(distance=800.0)), head_pose(head(distance=800.0, at=(50, -20)))
-    assert np.subtract(moved.centre, first.centre) == pytest.approx((50, -20), abs=1)
-
-
-def test_a_bent_photo_turns_less_than_the_head_and_not_by_nothing() -> None:
-    # What docs/liveness.md admits: a strongly bent sheet has some relief of its own.
-    for radius, most in ((300, 6), (100, 16), (60, 25)):
-        sideways, _ = change(photo(bent_to=radius, yaw=45.0), photo(bent_to=radius))
-        assert 0.5 < sideways < most
-
-
 @pytest.mark.parametrize("points", [np.zeros((5, 2)), np.outer(np.arange(5), [1.0, 2.0])])
 def test_points_that_span_no_plane_are_refused(points: np.ndarray) -> None:
     with pytest.raises(LowQuality):

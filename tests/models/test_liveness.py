@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from models.alignment import template
-from models.errors import ModelError, NoFace, PackError
+from models.errors import ModelError, PackError
 from models.liveness import LivenessInput, box_region, crop_face, square_region
 from models.pack import ModelPack
 from tests.models.graphs import (
@@ -174,13 +174,6 @@ def test_minifasnet_is_fed_bgr_from_0_to_255_and_its_share_of_class_1_is_the_sco
     assert 0.05 < expected < 0.95
 
 
-def test_a_softmax_in_the_graph_is_not_taken_twice(tmp_path):
-    inside = pack_of(tmp_path / "a", **{NAMED: mean_liveness(WEIGHTS, softmax=True)})
-    outside = pack_of(tmp_path / "b", **{NAMED: NET})
-    scores = [pack.liveness.score(picture(5), BOX) for pack in (inside, outside)]
-    assert scores[0] == pytest.approx(scores[1], abs=1e-5)
-
-
 def test_several_graphs_are_averaged(tmp_path):
     names = (NAMED, "4_0_0_80x80_net")
     other = mean_liveness(WEIGHTS[:, [1, 0, 2]])
@@ -265,15 +258,6 @@ def test_a_photo_is_decoded_and_detected_once(tmp_path, monkeypatch):
     assert sample.box == pytest.approx(BOX, abs=1e-3)
     several = pack.embed_photos([data, data], quality=None, liveness=True)
     assert [one.liveness for one in several] == [sample.liveness] * 2
-
-
-def test_a_pack_without_a_graph_has_no_liveness_and_says_so(tmp_path):
-    pack = pack_of(tmp_path)
-    assert pack.liveness is None
-    with pytest.raises(PackError, match="no liveness graph"):
-        pack.embed_photo(png(picture()), quality=None, liveness=True)
-    with pytest.raises(NoFace):
-        pack.embed_photo(png(np.zeros((112, 112, 3), np.uint8)), quality=None)
 
 
 SE = "minifasnet_v2se_1.5_128x128.onnx"

@@ -63,29 +63,11 @@ def test_the_digest_is_of_the_upright_pixels_and_not_of_the_file(tmp_path):
     assert pack.embed_photo(files[0], quality=None).picture is None
 
 
-def test_a_nested_folder_of_the_same_name(tmp_path):
-    write_pack(tmp_path / "antelopev2" / "antelopev2", emb=pooling_embedder())
-    assert ModelPack.load(tmp_path / "antelopev2").info.name == "antelopev2"
-    write_pack(tmp_path / "other" / "inner", emb=pooling_embedder())
-    with pytest.raises(PackError, match=r"no \.onnx files"):
-        ModelPack.load(tmp_path / "other")
-
-
-def test_a_single_embedder_file(tmp_path):
-    folder = write_pack(tmp_path, face=pooling_embedder(), other=pooling_embedder(128))
-    assert ModelPack.load(folder / "face.onnx").info.name == "face"
-
-
 @pytest.mark.parametrize("missing", ["nowhere", "readme.txt"])
 def test_no_pack_there(tmp_path, missing):
     (tmp_path / "readme.txt").write_text("hello")
     with pytest.raises(PackError, match=missing):
         ModelPack.load(tmp_path / missing)
-
-
-def test_hidden_leftovers_are_not_part_of_a_pack(tmp_path):
-    folder = write_pack(tmp_path, emb=pooling_embedder(), **{"._emb": b"resource fork"})
-    assert ModelPack.load(folder).info.embedder_file == "emb.onnx"
 
 
 SCRFD, BLIND, YUNET = (
@@ -167,12 +149,6 @@ def test_without_a_detector_an_aligned_crop_is_embedded(blind):
     np.testing.assert_allclose(sample.embedding, unit(pooled(crop()[None]))[0], atol=2e-5)
     assert sample.box is None
     assert sample.quality.score is None
-
-
-def test_without_a_detector_a_square_is_resized(blind):
-    doubled = crop().repeat(2, axis=0).repeat(2, axis=1)
-    sample = blind.embed_photo(png(doubled), quality=None)
-    np.testing.assert_allclose(sample.embedding, unit(pooled(crop()[None]))[0], atol=2e-5)
 
 
 def test_without_a_detector_other_shapes_are_refused(blind):

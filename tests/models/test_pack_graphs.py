@@ -6,7 +6,7 @@ import pytest
 
 from models.errors import PackError
 from models.pack_graphs import Role, classify, inspect
-from models.sessions import Session, Tensor
+from models.sessions import Tensor
 from tests.models.graphs import pooling_embedder
 
 IMAGE = (None, 3, 112, 112)
@@ -47,27 +47,12 @@ def test_routing_by_signature(image, outputs, role):
     assert classify([Tensor("data", image)] * 2, made)[0] is Role.UNKNOWN
 
 
-def test_yunet_is_told_by_the_names_of_its_outputs():
-    outputs = [Tensor(name, (1, None, 1)) for name in YUNET]
-    image = [Tensor("input", (1, 3, None, None))]
-    assert classify(image, outputs)[0] is Role.YUNET
-    assert classify(image, outputs[1:])[0] is Role.UNKNOWN
-
-
 def test_an_open_input_size_is_an_embedder_once_it_is_stated():
     image, embedding = [Tensor("data", (None, 3, None, None))], [Tensor("e", (None, 512))]
     role, reason = classify(image, embedding)
     assert role is Role.UNKNOWN
     assert "pack.toml" in reason
     assert classify(image, embedding, input_size=112)[0] is Role.EMBEDDER
-
-
-def test_weights_listed_as_inputs_do_not_count():
-    proto = onnx.load_model_from_string(pooling_embedder())
-    weight = onnx.helper.make_tensor_value_info("factor", onnx.TensorProto.FLOAT, [])
-    proto.graph.input.append(weight)
-    session = Session(proto.SerializeToString(), name="x.onnx")
-    assert session.inputs == (Tensor("image", IMAGE),)
 
 
 @pytest.mark.parametrize(

@@ -67,11 +67,6 @@ def test_the_face_that_is_meant(
         assert select(faces, policy) is faces[boxes.index(taken)]
 
 
-def test_every_face_counts_where_no_size_is_asked_for() -> None:
-    with pytest.raises(MultipleFaces):
-        select([face(*MAIN), face(*SPECK)], SINGLE, min_size=0.0)
-
-
 @pytest.mark.parametrize("policy", [*FacePolicy, None])
 def test_no_face(policy: FacePolicy | None) -> None:
     with pytest.raises(NoFace, match="come closer"):

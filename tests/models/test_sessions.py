@@ -44,11 +44,6 @@ def test_a_provider_that_does_not_start_is_an_error(monkeypatch):
         Session(pooling_embedder(), name="x.onnx", providers=("cuda",))
 
 
-def test_threads_must_be_positive():
-    with pytest.raises(ModelError, match="at least 1"):
-        Session(pooling_embedder(), name="x.onnx", threads=0)
-
-
 def test_a_failed_run_says_nothing_of_its_input():
     session = Session(pooling_embedder(), name="x.onnx")
     with pytest.raises(ModelError, match=r"x\.onnx: inference failed") as caught:

@@ -1,9 +1,7 @@
 import cv2
 import numpy as np
-import pytest
 
-from models.decoding import decode_image
-from models.synthetic import draw_face, draw_people, draw_person, encode_photo
+from models.synthetic import draw_face, draw_people, draw_person
 
 
 def test_a_person_and_a_photo_are_their_seeds():
@@ -20,20 +18,3 @@ def test_size_scales_the_picture():
     assert large.shape == (224, 224, 3)
     reduced = cv2.resize(large, (112, 112), interpolation=cv2.INTER_AREA)
     assert np.abs(small.astype(int) - reduced.astype(int)).mean() < 8
-
-
-def test_an_encoded_photo_decodes_to_itself():
-    assert np.array_equal(decode_image(encode_photo(draw_face(2, 2))), draw_face(2, 2))
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        ({"identity": -1}, "seeds"),
-        ({"identity": 0, "photo": -1}, "seeds"),
-        ({"identity": 0, "size": 8}, "16 to 1024"),
-    ],
-)
-def test_impossible_requests_are_refused(arguments, said):
-    with pytest.raises(ValueError, match=said):
-        draw_face(**arguments)

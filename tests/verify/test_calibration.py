@@ -188,16 +188,6 @@ def test_the_cohort_is_new_every_time_and_the_rest_follows_the_seed() -> None:
     assert first.photo_consistency == second.photo_consistency
 
 
-def test_people_of_one_photo_each_set_thresholds_and_show_no_rejections() -> None:
-    contract = calibrate_people(draw_people(150, photos=(1,))).contract
-    point = contract.calibration("p2s")
-    assert point.levels[0].name == "fmr-1e-2"
-    assert all(level.fnmr.trials == 0 for level in point.levels)
-    assert point.calibrated_on["genuine_trials"] == 0
-    # The agreement of photos is that of strangers who match once in a thousand.
-    assert contract.photo_consistency == contract.probe_consistency
-
-
 def test_ten_fold_adds_the_accuracy_level(people: People) -> None:
     options = CalibrationOptions(protocol="ten-fold", probe_dims=(0,))
     result = calibrate_people(people, options=options)

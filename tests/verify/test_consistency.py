@@ -46,15 +46,6 @@ def test_mislabelled_photos_do_not_lower_it_below_what_strangers_reach() -> None
     assert limit(mislabelled).threshold == pytest.approx(lax)
 
 
-def test_strangers_set_it_where_photos_of_one_person_are_all_alike() -> None:
-    """Photos a second apart would ask for more than another day's photo of the person gives."""
-    people = draw_people(200, n=256, photos=(3,), noise=0.1, seed=4)
-    found = limit(people)
-    # Cosines of independent unit vectors are Gaussian with variance 1 / n: 4.75 deviations at 1e-6.
-    assert found.threshold == pytest.approx(4.75 / 16, rel=0.25)
-    assert found.refused.errors == 0
-
-
 @pytest.fixture
 def small_tiles(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(consistency, "TILE", 7)

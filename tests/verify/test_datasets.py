@@ -87,19 +87,6 @@ def test_lfw_pairs_become_positions(tmp_path: Path, separator: str) -> None:
     assert (pairs[1].first, pairs[1].second, pairs[1].same) == (0, 4, False)
 
 
-def test_lfw_pairs_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
-    folder = labelled_folder(make_folder(tmp_path / "faces", {"Ann": 2, "Bob": 3}))
-    plain, marked = tmp_path / "pairs.txt", tmp_path / "marked.txt"
-    plain.write_text(pairs_text(), encoding="utf-8")
-    marked.write_text(pairs_text(), encoding="utf-8-sig")
-    assert read_lfw_pairs(marked, folder.paths) == read_lfw_pairs(plain, folder.paths)
-    marked.write_bytes(b"10\t1\n\xff")
-    with pytest.raises(DatasetError, match="not UTF-8 text"):
-        read_lfw_pairs(marked, folder.paths)
-    with pytest.raises(DatasetError, match=r"absent\.txt is not there"):
-        read_lfw_pairs(tmp_path / "absent.txt", folder.paths)
-
-
 def test_pairs_of_photos_without_a_descriptor_are_left_out(tmp_path: Path) -> None:
     folder = labelled_folder(make_folder(tmp_path / "faces", {"Ann": 2, "Bob": 3}))
     file = tmp_path / "pairs.txt"

@@ -54,17 +54,3 @@ def test_a_wrong_line_is_named(tmp_path, line, said):
     file.write_text(HEADER + line + "\n")
     with pytest.raises(DatasetError, match=said):
         read_labels(file)
-
-
-def test_missing_columns_are_named(tmp_path):
-    file = tmp_path / "labels.csv"
-    file.write_text("file,age\n")
-    with pytest.raises(DatasetError, match="has no column gender"):
-        read_labels(file)
-
-
-def test_a_file_that_is_no_text_is_refused(tmp_path):
-    file = tmp_path / "labels.csv"
-    file.write_bytes(b"\xff\xfe\x00\x00")
-    with pytest.raises(DatasetError, match="is not UTF-8 text"):
-        read_labels(file)

@@ -214,16 +214,3 @@ def test_a_stricter_level_is_never_laxer(monkeypatch) -> None:
         for line in done.report.left_out
     )
     assert any("kind alike (9)" in line for line in done.report.left_out)
-
-
-def test_the_rule_needs_labels() -> None:
-    people = draw_people(20)
-    source = make_generator()
-    with pytest.raises(ContractError, match="need labels"):
-        calibrate(
-            people.descriptors,
-            people.names,
-            binding=make_binding(source.source_id),
-            source=source,
-            options=CalibrationOptions(worst_group=True),
-        )

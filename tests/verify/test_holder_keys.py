@@ -120,16 +120,6 @@ def test_without_the_key_no_score_is_enough(verifier: Verifier, keyed: Enrollmen
     assert (decision.accepted, decision.reason) == (False, "no_match")
 
 
-def test_a_thief_who_may_send_embeddings_chooses_a_key(
-    verifier: Verifier, keyed: Enrollment
-) -> None:
-    """What the key does not protect from: template and rotation key were stolen."""
-    template, salt = without_tenant(keyed), str(keyed.holder_salt)
-    inside = unit((template.foot + template.radii[0] * template.basis[0])[None])
-    probe = embeddings_of(holder_rotation(OTHER, salt, K).turned_back(inside.astype(np.float64)))[0]
-    assert verifier.decide_embedding(probe, keyed, holder_key=OTHER).accepted
-
-
 def test_a_template_that_needs_no_key_ignores_one(verifier: Verifier, enroller: Enroller) -> None:
     plain = enroller.from_embeddings(PEOPLE[:1])
     assert plain.holder_salt is None
@@ -138,35 +128,6 @@ def test_a_template_that_needs_no_key_ignores_one(verifier: Verifier, enroller: 
     ]
     assert decisions[0].accepted
     assert decisions[1:] == decisions[:1] * 2
-
-
-def test_clients_templates_and_lifted_probes_need_it_too(
-    contract: Contract, verifier: Verifier, enroller: Enroller
-) -> None:
-    data = lifted_by_a_client(contract, PEOPLE[0], contract.binding.m)
-    enrollment = enroller.from_template(data, holder=HOLDER)
-    turned_back = without_both(enrollment, KEY)
-    assert turned_back.contains(projected(PEOPLE[0])[None].astype(float), tol=3e-3).all()
-    probe = lifted_by_a_client(contract, PEOPLE[0], 2)
-    keyless = enroller.from_template(data)
-    as_before = verifier.decide_template(probe, keyless)
-    right = verifier.decide_template(probe, enrollment, holder_key=KEY)
-    assert right.accepted
-    assert right.similarity == pytest.approx(as_before.similarity, abs=2e-3)
-    for key in (OTHER, None):
-        assert not verifier.decide_template(probe, enrollment, holder_key=key).accepted
-
-
-def test_an_export_keeps_the_holders_rotation(
-    contract: Contract, verifier: Verifier, enroller: Enroller, keyed: Enrollment
-) -> None:
-    exported = wire.encode(without_tenant(keyed), contract_id=contract.contract_id)
-    imported = enroller.from_export(exported, holder_salt=keyed.holder_salt)
-    assert imported.template_id != keyed.template_id
-    assert imported.holder_salt == keyed.holder_salt
-    assert verifier.decide_embedding(PEOPLE[0], imported, holder_key=KEY).accepted
-    for key in (OTHER, None):
-        assert not verifier.decide_embedding(PEOPLE[0], imported, holder_key=key).accepted
 
 
 class CountedRotation:

@@ -15,10 +15,6 @@ def test_wilson_agrees_with_scipy(errors: int, trials: int) -> None:
     assert metrics.wilson(errors, trials) == pytest.approx((expected.low, expected.high), abs=1e-12)
 
 
-def test_wilson_without_trials_knows_nothing() -> None:
-    assert metrics.wilson(0, 0) == (0.0, 1.0)
-
-
 @given(scores, st.floats(0, 1))
 def test_threshold_is_the_laxest_that_holds_the_target(values: list[float], target: float) -> None:
     threshold = metrics.threshold_at_fmr(values, target)
@@ -50,12 +46,6 @@ def test_most_errors_is_the_largest_count_within_the_target(target: float, trial
     count = metrics.most_errors(target, trials)
     assert count / trials <= target
     assert (count + 1) / trials > target
-
-
-def test_resolvable_is_the_rule_of_three() -> None:
-    assert metrics.resolvable(1e-3, 3000)
-    assert not metrics.resolvable(1e-3, 2999)
-    assert not metrics.resolvable(1e-3, 3000, expected_errors=10)
 
 
 @given(scores, scores)
@@ -118,13 +108,6 @@ def test_subject_bootstrap_agrees_with_a_naive_one() -> None:
     assert rate.ci_low < wilson[0]
     assert rate.ci_high > wilson[1]
     assert rate.interval == "subject-bootstrap"
-
-
-def test_subject_bootstrap_without_errors_is_wilson() -> None:
-    rate = metrics.subject_bootstrap(
-        np.empty((0, 2), dtype=np.int64), people=9, trials=300, weighted_trials=lambda _: 300.0
-    )
-    assert (rate.ci_low, rate.ci_high) == metrics.wilson(0, 300)
 
 
 def test_subject_bootstrap_weighs_a_trial_within_one_person_once() -> None:

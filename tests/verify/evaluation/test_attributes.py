@@ -42,12 +42,6 @@ def test_the_vote_is_that_of_the_nearest_entries(k: int, monkeypatch: pytest.Mon
     ]
 
 
-def test_an_attribute_without_labels_is_not_guessed() -> None:
-    pool = DecoyPool(unit_rows(5), labels=[Attributes("Male", None)] * 5)
-    assert predict_attributes(unit_rows(2), pool) == [Attributes("Male", None)] * 2
-    assert predict_attributes(unit_rows(0), pool) == []
-
-
 def test_a_pool_without_labels_is_refused() -> None:
     with pytest.raises(DecoyError, match="this one has no labels"):
         predict_attributes(unit_rows(2), DecoyPool(unit_rows(5)))

@@ -92,13 +92,3 @@ def test_a_scheduler_that_is_not_there(absent: str, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(module, "CONNECT_SECONDS", 0.5)
     with pytest.raises(ClusterError, match="no Dask scheduler answers at"), cluster(absent):
         pass
-
-
-def test_a_scheduler_without_workers(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "CONNECT_SECONDS", 0.5)
-    with (
-        LocalCluster(n_workers=0, dashboard_address=":0") as empty,  # type: ignore[no-untyped-call]
-        pytest.raises(ClusterError, match="has no worker: start one"),
-        cluster(empty.scheduler_address),
-    ):
-        pass

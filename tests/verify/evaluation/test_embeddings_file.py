@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from models.extraction import Photo
-from tests.verify.evaluation.layouts import write
 from verify import DatasetError
 from verify.evaluation.embeddings_file import EmbeddingsFile, match, read_embeddings
 from verify.evaluation.verification_set import VerificationSet
@@ -103,16 +102,6 @@ HUGE = "{'descr': '<f4', 'fortran_order': False, 'shape': (9999999, 99999999)}"
 def npy(header: str) -> bytes:
     text = header.encode().ljust(117) + b"\n"
     return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text
-
-
-def test_a_cut_archive(tmp_path: Path) -> None:
-    np.savez(tmp_path / "e.npz", paths=PATHS, descriptors=ROWS)
-    data = (tmp_path / "e.npz").read_bytes()
-    for end in range(0, len(data), 31):
-        with pytest.raises(DatasetError):
-            read_embeddings(write(tmp_path / "cut.npz", data[:end]))
-    with pytest.raises(DatasetError, match="cannot be read"):
-        read_embeddings(tmp_path / "absent.npz")
 
 
 NAMES = ["Ann/Ann_0001.jpg", "Ann/Ann_0002.jpg", "Bob/Bob_0001.jpg"]

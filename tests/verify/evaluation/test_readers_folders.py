@@ -125,19 +125,6 @@ def test_cfp(tmp_path: Path) -> None:
     ]
 
 
-def test_cfp_without_photos(tmp_path: Path) -> None:
-    cfp_folder(tmp_path, photos=False)
-    sets = open_sets(tmp_path, pictures=False)
-    assert sets[1].pictures[1].name == "Data/Images/001/profile/02.jpg"
-    with pytest.raises(DatasetError, match=r"faults.*001/frontal/01.jpg is not there"):
-        open_sets(tmp_path)
-
-
-def test_cfp_in_a_folder_of_its_own(tmp_path: Path) -> None:
-    cfp_folder(tmp_path / "cfp-dataset")
-    assert [one.name for one in open_sets(tmp_path)] == ["cfp_ff", "cfp_fp"]
-
-
 @pytest.mark.parametrize(
     ("file", "text", "message"),
     [

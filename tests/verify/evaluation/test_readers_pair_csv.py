@@ -136,16 +136,6 @@ def test_a_folder_is_a_template_of_its_photos(tmp_path: Path) -> None:
         read(tmp_path, f"{HEADER}\nempty,photos/b1.png,1\nphotos/a1.png,photos,0\n")
 
 
-def test_photos_need_not_be_there(tmp_path: Path) -> None:
-    mine = read(tmp_path, table(HEADER, "x.png,y.png,1", OTHER), pictures=False)
-    assert [one.name for one in mine.pictures][:2] == ["x.png", "y.png"]
-
-
-def test_a_file_that_is_not_utf_8(tmp_path: Path) -> None:
-    with pytest.raises(DatasetError, match="not UTF-8"):
-        open_sets(write(tmp_path / "mine.csv", b"path_a,path_b,same\n\xff,b,1\n"))
-
-
 @pytest.mark.parametrize(
     "name", ["=SUM(A1)", "-1", "a[1]", "a|b", "a\x1b[31m", "a\udcff", "x" * 101]
 )

@@ -98,11 +98,6 @@ def test_a_line_of_the_report_says_what_its_row_says() -> None:
     assert list(shown["p-to-s"].values())[4:] == ["-"] * 4
 
 
-def test_the_spread_over_seeds_is_shown_where_there_are_two() -> None:
-    assert cells.accuracy({"accuracy_mean": 0.99, "accuracy_std_seeds": None}) == "99.00"
-    assert cells.accuracy({"accuracy_mean": 0.99, "accuracy_std_seeds": 0.0}) == "99.00 (± 0.00)"
-
-
 def test_the_report_says_where_its_numbers_come_from() -> None:
     results = made_results()
     other = results["datasets"][0] | {"name": "cfp_fp", "failures": [], "notes": ["it is odd"]}
