@@ -53,16 +53,11 @@ class Trials:
 def compare(
     trials: Trials, unit: Unit, plan: EvaluationPlan
 ) -> list[tuple[Json, NDArray[np.float64]]]:
-    """Compare all pairs, in every mode and metric of the plan.
+    """Compare all pairs, in every mode and metric of the plan: similarities (P,), 1 − d²/2.
 
-    Returns
-    -------
-    names
-        How a run is named: ``strategy``, ``decoys`` (pool, generator or None), ``shared_decoys``
-        (None without a pool), ``dim``, ``mode``, ``metric``, ``seed`` and ``lifted``, which photo
-        of each pair was lifted (first, second, both or None).
-    similarities : (P,) float64
-        1 − d²/2.
+    Each goes with its names: ``strategy``, ``decoys`` (pool, generator or None), ``shared_decoys``
+    (None without a pool), ``dim``, ``mode``, ``metric``, ``seed`` and ``lifted``, which photo of
+    each pair was lifted (first, second, both or None).
     """
     names: Json = {
         "strategy": unit.strategy,

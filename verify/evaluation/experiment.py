@@ -171,20 +171,12 @@ def trials_of(
 def run_trials(
     trials: Trials, plan: EvaluationPlan, *, executor: Executor, progress: Advance
 ) -> pd.DataFrame:
-    """Compute all units of a plan on one set.
+    """Compute all units of a plan on one set; ``progress`` counts them.
 
-    Parameters
-    ----------
-    progress
-        Called with the number of units done since the last call.
-
-    Returns
-    -------
-    runs
-        One line for each way of comparing, seed, lifted side and threshold search, in the order of
-        the plan and not of arrival. The columns are those of ``ROW``, ``seed`` and ``lifted``,
-        what :func:`measure` returns, and ``similarities`` (P,), ``curve`` (F,), the FNMR at each
-        FMR of ``fmr_grid``, and ``replicates`` (R, targets + F), the FNMR of resampled pairs.
+    Returns one line for each way of comparing, seed, lifted side and threshold search, in the order
+    of the plan and not of arrival. The columns are those of ``ROW``, ``seed`` and ``lifted``, what
+    :func:`measure` returns, and ``similarities`` (P,), ``curve`` (F,), the FNMR at each FMR of
+    ``fmr_grid``, and ``replicates`` (R, targets + F), the FNMR of resampled pairs.
     """
     units = units_of(plan, trials.sources, n=trials.embeddings.shape[1])
     records: list[Json] = []
@@ -210,10 +202,7 @@ def run_trials(
 def run_unit(trials: Trials, plan: EvaluationPlan, unit: Unit) -> list[Json]:
     """Compute the runs of one unit of work.
 
-    Notes
-    -----
-    Products run on one thread each: workers share a machine, and several threads would round
-    differently.
+    Products run on one thread each: several would round differently on another machine.
     """
     with single_threaded():
         searches = ("grid", "exact") if unit.raw and trials.folds is not None else ("exact",)

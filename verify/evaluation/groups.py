@@ -29,17 +29,10 @@ def least_of_highest(errors: float, trials: int, *, groups: int) -> float:
 
 
 def mean_rate(errors: float, trials: int) -> Json:
-    """Error rate over one or several runs on the same trials.
+    """Mean errors of one run over its trials, with Wilson's 95 % interval for *one* run.
 
-    Returns
-    -------
-    value
-        Errors over trials; None where nothing was tried.
-    errors, trials
-    ci_low, ci_high
-        Wilson's 95 % interval for these errors in the trials of *one* run. Further runs lift the
-        same photos anew, which tells nothing about further people: they do not narrow it. It takes
-        trials as independent; people who are in several of them make it too narrow.
+    Further runs lift the same photos anew, which tells nothing about further people: they do not
+    narrow it. It takes trials as independent; people who are in several make it too narrow.
     """
     low, high = wilson(errors, trials)
     value = errors / trials if trials else None
@@ -56,22 +49,15 @@ def by_group(
     thresholds: Sequence[float],
     target_fmr: float,
 ) -> tuple[list[Json], Json]:
-    """Count the errors of each group.
+    """Count the errors of each group, over one or several runs on the same pairs.
 
-    Returns
-    -------
-    groups
-        ``fmr`` and ``fnmr`` of each group, in the order of names; ages in the order of years.
-        ``judged`` says whether there are trials enough to compare the rate with other groups': for
-        the FMR :func:`fmr_judged`, for the FNMR ``MIN_GENUINE``.
-    summary
-        Rates of all trials (``overall``), of those within a group (``pooled``) and of two groups
-        (``cross_fmr``); ``mixed``, genuine trials whose photos have two labels (age, or a fault of
-        the labels); trials with a photo without a label. ``worst`` is the judged group with the
-        highest rate, ``apart`` where its interval, at 1 − 0.05 / groups, lies above the rate of
-        all groups together; None where fewer than two are judged, or none has an error. ``ratio``
-        is the highest rate over the geometric mean of the judged groups, the measure of inequity
-        of ISO/IEC 19795-10 and of NIST's FRVT (IR 8429); None where a judged group has no error.
+    Returns the groups' ``fmr`` and ``fnmr``, ages in the order of years, and a summary. ``judged``
+    says whether a rate has trials enough to be compared: for the FMR :func:`fmr_judged`, for the
+    FNMR ``MIN_GENUINE``. The summary has the rates of all trials (``overall``), of those within a
+    group (``pooled``) and of two groups (``cross_fmr``); genuine trials of photos with two labels
+    (``mixed``); trials without a label; the ``worst`` judged group, ``apart`` where its interval,
+    at 1 − 0.05 / groups, lies above the pooled rate; and the worst rate over the geometric mean of
+    the judged ones, the ``ratio`` of ISO/IEC 19795-10 and of NIST's FRVT (IR 8429).
     """
     wrong = sum(
         ((run >= limit) != same).astype(np.int64)

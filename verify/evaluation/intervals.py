@@ -25,13 +25,8 @@ def replicate_weights(
 ) -> Iterator[tuple[Array64, Array64]]:
     """Draw people with replacement; pairs, where the set does not name people.
 
-    One replicate is in memory at a time.
-
-    Yields
-    ------
-    genuine : (G,) float64
-    impostor : (I,) float64
-        Weights of the pairs. A replicate without any genuine or impostor pair is drawn anew.
+    Yields the weights of the genuine (G,) and the impostor pairs (I,), one replicate at a time. One
+    without any of either is drawn anew.
     """
     same, people = trials.same, trials.people
     generator = np.random.default_rng(seed)

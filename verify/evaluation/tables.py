@@ -28,7 +28,6 @@ from verify.evaluation.row_labels import (
 )
 
 LISTED_FAILURES = 20
-HASH_DIGITS = 12
 INTERVALS = {"subject-bootstrap": "bootstrap by subject", "pair-bootstrap": "bootstrap of pairs"}
 # A spreadsheet runs what begins so; after an apostrophe it is text.
 _FORMULAS = ("=", "+", "-", "@", "\t", "\r")
@@ -147,24 +146,18 @@ HOW_TO_READ = """## How to read this
 
 
 def _provenance(results: Row) -> str:
+    """Where the numbers come from; hashes and versions are in results.json."""
     model = results["model"]
     source = plain(model.get("pack") or model.get("embeddings"))
-    sha256 = model.get("embedder_sha256") or model.get("sha256")
     flip = ", of the photo and its mirror image" if results["options"].get("flip") else ""
-    lines = [f"Embeddings: {source}, n = {model['n']}, SHA-256 {_short(sha256)}{flip}"]
-    lines += [
-        f"Decoys: {code(decoys['file'])}, {_decoys(decoys)}, SHA-256 {_short(decoys['sha256'])}"
-        for decoys in results["decoys"]
-    ]
     seeds = range(results["seed"], results["seed"] + results["repeats"])
-    lines.append(f"Seeds: {', '.join(map(str, seeds))}")
-    software = results["software"].items()
-    lines.append("Software: " + ", ".join(f"{plain(k)} {plain(v)}" for k, v in software))
+    lines = [
+        f"Embeddings: {source}, n = {model['n']}{flip}",
+        *(f"Decoys: {code(decoys['file'])}, {_decoys(decoys)}" for decoys in results["decoys"]),
+        f"Seeds: {', '.join(map(str, seeds))}",
+        f"Software: veilface {plain(results['software']['veilface'])}",
+    ]
     return "\n".join(f"- {line}" for line in lines)
-
-
-def _short(sha256: str | None) -> str:
-    return code((sha256 or "")[:HASH_DIGITS])
 
 
 def _decoys(decoys: Row) -> str:
@@ -175,22 +168,18 @@ def _decoys(decoys: Row) -> str:
 def _dataset(dataset: Row, rows: Sequence[Row]) -> list[str]:
     aligned = {None: "", True: ", aligned crops", False: ", detected and aligned here"}
     people = "" if dataset["people"] is None else f", {count(dataset['people'])} people"
-    hashed = [("photos", dataset["pictures_sha256"])]
-    hashed += [(code(name), sha256) for name, sha256 in dataset["protocol_files"]]
     lines = [
         f"{count(dataset['images'])} photos{people}{aligned[dataset['aligned']]}; "
         f"{count(rows[0]['n_genuine'])} genuine and {count(rows[0]['n_impostor'])} impostor "
         f"comparisons of {count(dataset['pairs'])} pairs.",
-        "SHA-256: " + ", ".join(f"{name} {_short(sha256)}" for name, sha256 in hashed if sha256),
     ]
     kinds = {INTERVALS[at["interval"]] for row in rows for at in row["fnmr_at_fmr"].values()}
     lines += [f"Intervals: {kind}." for kind in kinds]
-    for decoys in dataset["decoys"]:
-        left_out = decoys["left_out"]
-        lines.append(
-            f"Decoys used: {_decoys(decoys)}, source {_short(decoys['source_id'])}"
-            + (f"; {count(left_out)} left out that resemble people of this set" if left_out else "")
-        )
+    lines += [
+        f"Decoys left out that resemble people of this set: {count(decoys['left_out'])}."
+        for decoys in dataset["decoys"]
+        if decoys["left_out"]
+    ]
     lines += [f"Note: {plain(note)}" for note in dataset["notes"]]
     failures = dataset["failures"]
     if not failures:

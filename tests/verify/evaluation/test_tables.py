@@ -111,17 +111,15 @@ def test_the_report_says_where_its_numbers_come_from() -> None:
     assert report == markdown(results)
     assert not re.search(r"\b20\d\d-\d\d", report)
     head, lfw, cfp = re.split(r"(?m)^## (?:lfw|cfp_fp)$", report)
-    assert "- Embeddings: made_up, n = 24, SHA-256 `abababababab`\n" in head
-    assert "- Decoys: `pool.veil`, pool of 120 entries, labelled, SHA-256 `cdcdcdcdcdcd`" in head
+    assert "- Embeddings: made_up, n = 24\n" in head
+    assert "- Decoys: `pool.veil`, pool of 120 entries, labelled\n" in head
     assert "- Seeds: 0, 1\n" in head
-    assert f"- Software: veilface {version('veilface')}, python 3." in head
+    assert f"- Software: veilface {version('veilface')}\n" in head
     assert (
         "60 photos, 30 people, aligned crops; 50 genuine and 50 impostor comparisons of 100" in lfw
     )
-    assert "SHA-256: photos `121212121212`, `pairs.txt` `343434343434`" in lfw
-    assert "; 3 left out that resemble people of this set" in lfw
-    assert "Decoys used: pool of 4,000 entries, source `ffffffffffff`\n" in cfp
-    assert "Decoys used: generator, source `000000000000`\n" in cfp
+    assert "Decoys left out that resemble people of this set: 3." in lfw
+    assert "Decoys left out" not in cfp
     assert "Note: it is odd" in cfp
     assert "- lfw: FMR 0.0001 is not reported." in cfp
 

@@ -162,13 +162,8 @@ class _Unpickler(pickle.Unpickler):
         return _ALLOWED[f"{module}.{name}"]
 
 
-def _recognises(path: Path) -> bool:
-    if not path.is_file():
-        return False
-    with path.open("rb") as stream:
-        head = stream.read(2)
-    # Protocols 2 to 5 begin with their number; 0 and 1 are known by the suffix only.
-    return path.suffix.lower() == ".bin" or (head[:1] == b"\x80" and head[1:] in b"\2\3\4\5")
-
-
-READER = Reader("an InsightFace .bin file", _recognises, read_bin)
+READER = Reader(
+    "an InsightFace .bin file",
+    lambda path: path.suffix.lower() == ".bin" and path.is_file(),
+    read_bin,
+)

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from models.extraction import Photo
-from verify.datasets import DatasetError, parse_lfw_pairs
+from verify.datasets import parse_lfw_pairs
 from verify.evaluation.readers.reader import (
     Reader,
     assemble,
@@ -51,16 +51,9 @@ def read_lfw(root: Path, pictures: bool) -> list[VerificationSet]:
 
 
 def _photo_root(root: Path, people: set[str]) -> Path:
-    folders = sorted(one for one in root.iterdir() if one.is_dir() and one.name[0] != ".")
-    if any(one.name in people for one in folders):
-        return root
-    inside = [one for one in folders if any((one / person).is_dir() for person in people)]
-    if len(inside) > 1:
-        names = ", ".join(one.name for one in inside)
-        raise DatasetError(
-            f"{root}: the photos of {PAIRS} may lie in {names}; copy {PAIRS} into the one meant"
-        )
-    return inside[0] if inside else root
+    inside = sorted(one for one in root.iterdir() if one.is_dir() and one.name[0] != ".")
+    has_people = (one for one in (root, *inside) if any((one / who).is_dir() for who in people))
+    return next(has_people, root)
 
 
 READER = Reader(

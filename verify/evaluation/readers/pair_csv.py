@@ -1,6 +1,5 @@
 """A list of pairs as CSV, for a user's own photos: with folds or without, of photos or folders."""
 
-import csv
 import os.path
 from collections.abc import Sequence
 from dataclasses import replace
@@ -101,14 +100,8 @@ def _from_zero(path: Path, trials: Sequence[Trial]) -> list[Trial]:
     ]
 
 
-def _recognises(path: Path) -> bool:
-    if not path.is_file():
-        return False
-    with path.open("rb") as stream:
-        head = stream.read(1024)
-    first = head.decode("utf-8-sig", "replace").splitlines()[:1]
-    columns = next(csv.reader(first), []) if first else []
-    return path.suffix.lower() == ".csv" or columns[:1] == [REQUIRED[0]]
-
-
-READER = Reader("a pair CSV (path_a,path_b,same[,fold])", _recognises, read_pair_csv)
+READER = Reader(
+    "a pair CSV (path_a,path_b,same[,fold])",
+    lambda path: path.suffix.lower() == ".csv" and path.is_file(),
+    read_pair_csv,
+)
