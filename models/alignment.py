@@ -37,19 +37,11 @@ def template(size: int) -> NDArray[np.float64]:
 def similarity_transform(source: ArrayLike, target: ArrayLike) -> NDArray[np.float64]:
     """Least-squares similarity (rotation, uniform scale, translation; no shear, no mirror).
 
+    Of corresponding points, (k, 2), not all equal: ``target ≈ M[:, :2] @ source + M[:, 2]``.
+
     In the plane Umeyama's problem has a closed form: with points as complex numbers it is the
     regression ``w = a z + b`` with one complex slope, whose modulus is the scale and whose
     argument the rotation.
-
-    Parameters
-    ----------
-    source, target
-        Corresponding points, shape (k, 2), k of at least 2, not all equal.
-
-    Returns
-    -------
-    ndarray of float64, shape (2, 3)
-        ``target ≈ M[:, :2] @ source + M[:, 2]``.
 
     References
     ----------
@@ -71,22 +63,7 @@ def similarity_transform(source: ArrayLike, target: ArrayLike) -> NDArray[np.flo
 def align(
     image: NDArray[np.uint8], keypoints: NDArray[np.floating], *, size: int
 ) -> NDArray[np.uint8]:
-    """Crop a face so that its five points lie on the template.
-
-    Parameters
-    ----------
-    image
-        uint8, shape (h, w, 3).
-    keypoints
-        Shape (5, 2), pixels of ``image``, in the order of the template.
-    size
-        Side of the crop in pixels.
-
-    Returns
-    -------
-    ndarray of uint8, shape (size, size, 3)
-        Bilinear warp, 0 outside of the image.
-    """
+    """Crop a face so that its five points, (5, 2), lie on the template: bilinear, 0 outside."""
     matrix = similarity_transform(keypoints, template(size))
     crop = cv2.warpAffine(
         image, matrix, (size, size), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT

@@ -224,22 +224,11 @@ def letterbox(
 ) -> tuple[NDArray[np.uint8], float]:
     """Resize into the top-left corner of a black canvas, keeping the aspect ratio.
 
+    Also returns the scale, in canvas pixels per image pixel.
+
     The sides are cut to whole pixels and the scale is that of the cut height, as InsightFace
     does: embedders are trained and evaluated on crops that come from its key points, and half a
     pixel of the canvas is several pixels of a photo that is far from square.
-
-    Parameters
-    ----------
-    size
-        Height and width of the canvas.
-    enlarge
-        Whether a picture smaller than the canvas is enlarged to fill it.
-
-    Returns
-    -------
-    canvas : ndarray of uint8, shape (height, width, 3)
-    scale : float
-        Canvas pixels per image pixel.
     """
     height, width = image.shape[:2]
     ratio = height / width

@@ -106,13 +106,8 @@ class YuNet(Detector):
         size = self.canvas(image, size)
         canvas, scale = letterbox(image, size, enlarge=False)
         blob = channels_first(canvas, (2, 1, 0))
-        outputs = dict(
-            zip(
-                YUNET_OUTPUTS,
-                self._session.run({self._input_name: blob}, YUNET_OUTPUTS),
-                strict=True,
-            )
-        )
+        answers = self._session.run({self._input_name: blob}, YUNET_OUTPUTS)
+        outputs = dict(zip(YUNET_OUTPUTS, answers, strict=True))
         boxes, scores, keypoints = [], [], []
         for stride in STRIDES:
             rows, columns = size[0] // stride, size[1] // stride

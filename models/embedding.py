@@ -62,15 +62,7 @@ class Embedder:
         self.n = self._normalised(self._raw(_noise(preprocessing.size)[:1])).shape[1]
 
     def embed(self, crops: NDArray[np.uint8], *, flip: bool) -> Rows:
-        """Embed aligned crops.
-
-        Parameters
-        ----------
-        crops
-            RGB uint8, shape (B, s, s, 3) with the size of the preprocessing.
-        flip
-            Whether the raw embedding of the mirrored crop is added before normalising.
-        """
+        """Embed aligned crops."""
         raw = self._raw(self._checked(crops))
         return self._normalised(raw + self._raw(crops[:, :, ::-1]) if flip else raw)
 

@@ -106,8 +106,6 @@ class ModelPack:
 
         Parameters
         ----------
-        path
-            Folder (one nested folder of the same name is tolerated) or file.
         providers
             Execution providers, best first; an absent one is an error.
         threads
@@ -254,13 +252,6 @@ class ModelPack:
 
         A pack without a detector takes the photo as an aligned crop: square, resized to the
         embedder's size where it differs.
-
-        Parameters
-        ----------
-        data
-            JPEG, PNG, WebP or BMP.
-        options
-            As in `PhotoOptions`; what `crop_photo` takes by default.
 
         Raises
         ------
