@@ -3,13 +3,12 @@
 Imports the layer below only: ``templates`` and ``models``.
 """
 
-from enroll.enroller import Enroller, Enrollment, Holder, PhotoResult
+from enroll.enroller import Enroller, Enrollment, Holder
 from enroll.public_contract import PublicContract
 
 __all__ = [
     "Enroller",
     "Enrollment",
     "Holder",
-    "PhotoResult",
     "PublicContract",
 ]

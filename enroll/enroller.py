@@ -9,7 +9,7 @@ and then the tenant's, so that clients never need the tenant's.
 
 import secrets
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import cast
 
 import numpy as np
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from models.decoding import DEFAULT_LIMITS, ImageLimits
 from models.pack import ModelPack
-from models.quality import DEFAULT_QUALITY, QualityLimits
+from models.quality import DEFAULT_QUALITY, Quality, QualityLimits
 from models.selection import FacePolicy
 from templates.contract import wire
 from templates.contract.document import Contract
@@ -44,14 +44,6 @@ class Holder:
 
 
 @dataclass(frozen=True)
-class PhotoResult:
-    """What is told about one photo: its position, and its quality where a photo was sent."""
-
-    index: int
-    quality: object | None = None
-
-
-@dataclass(frozen=True)
 class Enrollment:
     """One private template, ready for the store.
 
@@ -61,8 +53,8 @@ class Enrollment:
         Rotated template in the wire format. Private: to be sealed, never logged.
     template_id
         Random, 32 hexadecimal digits; its rotation is derived from it.
-    per_photo
-        One result per photo; empty for a client's template.
+    qualities
+        Of each photo; None for an embedding, and empty for a client's template.
     photos
         How many different photos were averaged: one that is given twice counts once.
     holder_salt
@@ -72,9 +64,9 @@ class Enrollment:
     wire: bytes = field(repr=False)
     template_id: str
     contract_id: str
-    per_photo: tuple[PhotoResult, ...]
-    photos: int = 0
     holder_salt: str | None = None
+    qualities: tuple[Quality | None, ...] = ()
+    photos: int = 0
 
 
 class Enroller:
@@ -152,7 +144,7 @@ class Enroller:
             [cast("bytes", sample.picture) for sample in samples],
             attributes,
             holder,
-            [PhotoResult(index, sample.quality) for index, sample in enumerate(samples)],
+            [sample.quality for sample in samples],
         )
 
     def from_embeddings(
@@ -179,8 +171,8 @@ class Enroller:
             Where the embeddings part into two groups less alike than ``photo_consistency``.
         """
         rows = unit_rows(embeddings, n=self._contract.binding.n, most=MAX_PHOTOS)
-        results = [PhotoResult(index) for index in range(len(rows))]
-        return self._lifted(rows, [row.tobytes() for row in rows], attributes, holder, results)
+        photos = [row.tobytes() for row in rows]
+        return self._lifted(rows, photos, attributes, holder, [None] * len(rows))
 
     def _lifted(
         self,
@@ -188,7 +180,7 @@ class Enroller:
         photos: Sequence[bytes],
         attributes: Attributes | None,
         holder: Holder | None,
-        results: Sequence[PhotoResult],
+        qualities: Sequence[Quality | None],
     ) -> Enrollment:
         contract, binding = self._contract, self._contract.binding
         descriptor = mean_embedding(rows, consistency=contract.photo_consistency)
@@ -207,11 +199,8 @@ class Enroller:
             stream=stream,
             attributes=named,
         )
-        return self._enrollment(
-            *self._turned_by_holder(lifted[0], holder),
-            per_photo=tuple(results),
-            photos=len(distinct_rows(rows)),
-        )
+        enrollment = self._enrollment(*self._turned_by_holder(lifted[0], holder))
+        return replace(enrollment, qualities=tuple(qualities), photos=len(distinct_rows(rows)))
 
     def from_template(self, data: bytes, *, holder: Holder | None = None) -> Enrollment:
         """Enroll a template that a client lifted, in the wire format, un-rotated.
@@ -281,16 +270,9 @@ class Enroller:
         rotation = holder_rotation(holder.key, salt, self._contract.binding.axes)
         return subspace.turned_by(rotation.turned), salt
 
-    def _enrollment(
-        self,
-        subspace: SubspaceBatch,
-        holder_salt: str | None,
-        *,
-        per_photo: tuple[PhotoResult, ...] = (),
-        photos: int = 0,
-    ) -> Enrollment:
+    def _enrollment(self, subspace: SubspaceBatch, holder_salt: str | None) -> Enrollment:
         """Turn a template by a rotation of the tenant's, and encode it."""
         contract_id, template_id = self._contract.contract_id, secrets.token_hex(16)
         turned = subspace.turned_by(self._rotation.of(template_id).turned)
         data = wire.encode(turned, contract_id=contract_id, dtype=WIRE_DTYPE)
-        return Enrollment(data, template_id, contract_id, per_photo, photos, holder_salt)
+        return Enrollment(data, template_id, contract_id, holder_salt)

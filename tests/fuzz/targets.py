@@ -115,7 +115,7 @@ def probe(folder: Path) -> Target:
     verifier = Verifier(contract, make_generator(), rotation=rotation)
     enrolled = subspace(K, M, 5).turned_by(rotation.of("template").turned)
     data = wire.encode(enrolled, contract_id=contract.contract_id)
-    stored = Enrollment(data, "template", contract.contract_id, ())
+    stored = Enrollment(data, "template", contract.contract_id)
     templates = Templates(contract.contract_id)
     right = [
         wire.encode(subspace(K, m), contract_id=contract.contract_id, dtype=dtype)

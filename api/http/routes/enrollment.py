@@ -10,7 +10,6 @@ from api.http.requests import EnrollmentForm, EnrollmentJson
 from api.http.schemas import EnrollmentAnswer, Photo
 from enroll import Holder
 from enroll.enroller import MAX_PHOTOS
-from models.quality import Quality
 from templates.keys.holder_key import wipe
 from templates.store.subject_rows import Source
 
@@ -99,8 +98,8 @@ async def enroll(
                 replaced=not stored.created,
                 holder_key=enrollment.holder_salt is not None,
                 images=[
-                    Photo(index=result.index, status="used", quality=_measured(result.quality))
-                    for result in enrollment.per_photo
+                    Photo(index=index, status="used", quality=quality.as_dict() if quality else {})
+                    for index, quality in enumerate(enrollment.qualities)
                 ],
             )
 
@@ -108,7 +107,3 @@ async def enroll(
     response.status_code = 200 if answer.replaced else 201
     response.headers["ETag"] = etag(answer.template_id)
     return answer
-
-
-def _measured(quality: object) -> dict[str, float | None]:
-    return quality.as_dict() if isinstance(quality, Quality) else {}
