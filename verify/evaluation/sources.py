@@ -42,7 +42,7 @@ def without_test_people(
     """Leave pool entries out that resemble a person of the set.
 
     A person who was not acquired, or resembles their own photos less than ``SAME_PERSON``, stays
-    in; :func:`resemblance` says how many genuine pairs that concerns.
+    in.
     """
     kept = []
     for facts in sources:
