@@ -1,7 +1,6 @@
 """From the photos of a set to embeddings: by a model pack, or from a file that has them."""
 
-import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -33,7 +32,6 @@ class EmbeddedSet:
     failures: tuple[Failure, ...]  # the others; ``path`` is the photo's name
     mirrored: NDArray[np.float32] | None = None  # the same rows with the mirror image added
     aligned: bool | None = None  # None where the photos were not embedded here
-    pictures_sha256: str = ""  # of all photos; empty where they were not read
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,33 +83,20 @@ class PackEmbedder:
     def embed(
         self, pairs: VerificationSet, *, cache: EmbeddingCache | None, progress: Progress
     ) -> EmbeddedSet:
-        """Embed the photos of a set, equal ones once; those that fail are counted."""
-        contents = digests(pairs)
+        """Embed the photos of a set; those that fail are counted."""
         aligned = self._aligned(pairs)
-        # By content, so that copies are embedded once.
-        photos = {
-            content: replace(picture, name=content)
-            for picture, content in zip(pairs.pictures, contents, strict=True)
-            if content
-        }
+        photos = [replace(one, name=str(place)) for place, one in enumerate(pairs.pictures)]
         extractor = Extractor(self.pack, aligned=aligned, cache=cache, mirrored=self.mirrored)
         with progress(f"embedding {pairs.name}", len(photos)) as advance:
-            extraction = extractor.extract(photos.values(), progress=advance)
-        row_of = {path.name: row for row, path in enumerate(extraction.paths)}
-        reason_of = {failure.path.name: failure for failure in extraction.failures}
-        reason_of[""] = Failure(Path(), "unreadable_file", "The file cannot be read.")
+            extraction = extractor.extract(photos, progress=advance)
+        rows = np.full(len(photos), -1, dtype=np.int64)
+        rows[[int(path.name) for path in extraction.paths]] = np.arange(len(extraction.paths))
+        failures = tuple(
+            replace(failure, path=Path(pairs.pictures[int(failure.path.name)].name))
+            for failure in extraction.failures
+        )
         return EmbeddedSet(
-            pairs,
-            extraction.embeddings,
-            np.array([row_of.get(content, -1) for content in contents], dtype=np.int64),
-            tuple(
-                replace(reason_of[content], path=Path(picture.name))
-                for picture, content in zip(pairs.pictures, contents, strict=True)
-                if content not in row_of
-            ),
-            extraction.mirrored,
-            aligned,
-            digest_of_pictures(contents),
+            pairs, extraction.embeddings, rows, failures, extraction.mirrored, aligned
         )
 
     def _aligned(self, pairs: VerificationSet) -> bool:
@@ -129,25 +114,6 @@ class PackEmbedder:
 
 
 Embedder = PackEmbedder | FileEmbedder
-
-
-def digests(pairs: VerificationSet) -> list[str]:
-    """SHA-256 of every photo, in the order of the set; a photo that cannot be read has none.
-
-    One photo is in memory at a time.
-    """
-    contents = []
-    for picture in pairs.pictures:
-        try:
-            contents.append(hashlib.sha256(picture.read()).hexdigest())
-        except OSError:
-            contents.append("")
-    return contents
-
-
-def digest_of_pictures(contents: Sequence[str]) -> str:
-    """Name the photos of a set: equal for equal photos in equal order, whatever holds them."""
-    return hashlib.sha256("".join(contents).encode()).hexdigest()
 
 
 def are_aligned(pairs: VerificationSet, size: int) -> bool:

@@ -88,7 +88,6 @@ def _dataset(result: SetResult) -> Json:
         "impostor": pairs.impostor,
         "people": None if pairs.people is None else len(set(pairs.people)),
         "aligned": faces.aligned,
-        "pictures_sha256": faces.pictures_sha256,
         "protocol_files": [list(entry) for entry in pairs.protocol_files],
         "failures": [
             {"image": failure.path.as_posix(), "code": failure.code, "reason": failure.reason}

@@ -51,7 +51,7 @@ def _document() -> str:
     trials = replace(known, name="lfw", mirrored=known.embeddings, sources=sources)
     with ThreadPoolExecutor(2) as executor:
         runs = run_trials(trials, PLAN, executor=executor, progress=lambda _: None)
-    faces = made_faces(aligned=True, pictures_sha256="12" * 32)
+    faces = made_faces(aligned=True)
     model = Model(N, {"pack": "made_up", "embedder_sha256": "ab" * 32})
     results = [SetResult(faces, trials, facts, None)]
     made = document(PLAN, model, facts, runs, results, None, options={})
