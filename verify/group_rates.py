@@ -64,7 +64,10 @@ class PeopleGroups:
 def people_groups(
     labels: PhotoLabels, photos: Indices, person_of: Indices, *, people: int
 ) -> tuple[PeopleGroups, ...]:
-    """Put people into groups; equal votes of their photos go to the group that comes first."""
+    """Put people into groups; equal votes of their photos go to the group that comes first.
+
+    ``photos`` are the positions in the labels of those that are used, (N,), ``person_of`` theirs.
+    """
     groups = []
     for attribute, column in labels.of.items():
         own = [column[photo] for photo in photos]
@@ -113,7 +116,9 @@ def group_rates(
 def worst_group_threshold(
     threshold: float, target: float, groups: Sequence[PeopleGroups], impostors: Impostors
 ) -> tuple[float, list[str]]:
-    """Raise the threshold of all trials until no group's FMR exceeds the target.
+    """Raise the threshold of all trials until no group's FMR exceeds the target, if at all.
+
+    Also returns the groups whose impostor trials are too few, with their counts.
 
     A group is heeded where it has trials to *set* a threshold by, as for all of them together
     (``EXPECTED_ERRORS``); to be judged, a tenth of that is enough.

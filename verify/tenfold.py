@@ -104,7 +104,7 @@ def require_folds(folds: NDArray[np.int64]) -> None:
 def ten_fold(
     similarities: ArrayLike, same: ArrayLike, folds: ArrayLike, *, search: Search = best_threshold
 ) -> TenFold:
-    """Run the protocol."""
+    """Run the protocol on the similarity, truth and fold (0 … 9) of every pair, each (P,)."""
     scores = np.asarray(similarities, dtype=np.float64)
     truth = np.asarray(same, dtype=np.bool_)
     numbers = np.asarray(folds, dtype=np.int64)
