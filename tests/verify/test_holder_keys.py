@@ -120,6 +120,16 @@ def test_without_the_key_no_score_is_enough(verifier: Verifier, keyed: Enrollmen
     assert (decision.accepted, decision.reason) == (False, "no_match")
 
 
+def test_a_thief_who_may_send_embeddings_chooses_a_key(
+    verifier: Verifier, keyed: Enrollment
+) -> None:
+    """What the key does not protect from: template and rotation key were stolen."""
+    template, salt = without_tenant(keyed), str(keyed.holder_salt)
+    inside = unit((template.foot + template.radii[0] * template.basis[0])[None])
+    probe = embeddings_of(holder_rotation(OTHER, salt, K).turned_back(inside.astype(np.float64)))[0]
+    assert verifier.decide_embedding(probe, keyed, holder_key=OTHER).accepted
+
+
 def test_a_template_that_needs_no_key_ignores_one(verifier: Verifier, enroller: Enroller) -> None:
     plain = enroller.from_embeddings(PEOPLE[:1])
     assert plain.holder_salt is None
