@@ -21,7 +21,7 @@ from templates.errors import InvalidTemplate, SealError
 from templates.keys.rotation import TenantRotation
 from templates.keys.sealing import MasterKeyring
 from templates.space.subspace import SubspaceBatch
-from templates.store import TemplateStore
+from templates.store import Right, TemplateStore
 from templates.store.audit_archive import verify_archive
 from templates.store.audit_chain import Anchor, Head, head_columns, line_mac
 from templates.store.audit_log import Line
@@ -198,7 +198,8 @@ def test_the_drill(tmp_path: Path) -> None:
     prefix = deployment.token[3:15]
     assert (done["retired"], done["replace_api_keys"]) == (1, [prefix])
     assert done["enroll_again"] == {"default": ["alice", "bob"]}
-    token = operator(deployment, "keys", "replace", prefix, "--grace-hours", "0")["token"]
+    token = deployment.key(*Right)
+    assert operator(deployment, "keys", "revoke", prefix)["revoked"]
 
     with Client(create_app(deployment.settings)) as client:
         # Everybody can still log in with a photo.
