@@ -55,8 +55,8 @@ _DEVICE: ContextVar[str | None] = ContextVar("device", default=None)
 def on_device(device: str | None) -> Iterator[None]:
     """Compute the float32 distances of a block on a device of torch, and copy the results back.
 
-    Float64 and `paired_distances` stay on the processor. A thread that the block starts is outside
-    it, unless it runs in a copy of the context.
+    Float64 and pairs of a point and a template (`paired_distances`) stay on the processor. A thread
+    that the block starts is outside it, unless it runs in a copy of the context.
 
     Parameters
     ----------
@@ -190,9 +190,10 @@ def paired_distances(
     dtype: DTypeLike = np.float32,
     as_stored: bool = False,
 ) -> Floats:
-    """Distances of probe i to template i, computed by NumPy in float64 whatever ``dtype`` is.
+    """Distances of probe i to template i, computed in float64 whatever ``dtype`` is.
 
-    Parameters and errors are those of `pairwise_distances`.
+    Under `on_device`, float32 distances of lifted probes are computed there. Parameters and errors
+    are those of `pairwise_distances`.
 
     Parameters
     ----------
@@ -208,6 +209,12 @@ def paired_distances(
     probes = _checked(probes, templates, dtype)
     if len(probes) != len(templates):
         raise TemplateError(f"{len(probes)} probes do not pair with {len(templates)} templates")
+    device = None if np.dtype(dtype) == np.float64 else _DEVICE.get()
+    if device is not None and isinstance(probes, SubspaceBatch):
+        distances: Floats = _torch().paired(
+            probes, templates, metric=metric, steps=steps, device=device
+        )
+        return distances
     every = np.arange(len(probes))
     return exact.pairs(
         probes, templates, every, every, metric=metric, steps=steps, as_stored=as_stored

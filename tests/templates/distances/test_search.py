@@ -179,10 +179,13 @@ def test_a_device_holds_for_its_block_alone_and_not_for_float64(
     with on_device("cpu"):
         there = pairwise_distances(templates, templates, metric=metric)
         pairwise_distances(templates, templates, metric=metric, dtype=np.float64)
+        diagonal = paired_distances(templates, templates[[1, 2, 3, 3]], metric=metric)
         with on_device(None):
             here = pairwise_distances(templates, templates, metric=metric)
     assert used == ["cpu"]
     np.testing.assert_allclose(there, here, atol=2e-5)
+    expected = paired_distances(templates, templates[[1, 2, 3, 3]], metric=metric)
+    np.testing.assert_allclose(diagonal, expected, atol=2e-5)
 
 
 def test_a_device_that_is_not_there_is_refused() -> None:
