@@ -5,26 +5,12 @@ from typing import Annotated
 
 import typer
 
-from api.cli.audit_report import (
-    Limits,
-    Out,
-    Seed,
-    limits_of,
-    model_json,
-    reported,
-    served_scheme,
-)
+from api.cli.audit_report import Limits, Out, Seed, limits_of, model_json, reported, served_scheme
 from api.cli.console import message, share_done
 from api.cli.descriptors import BULK, Aligned, Cache, Flip, bulk_pack, extract
 from api.cli.errors import UsageError, require_extra
 from api.cli.inputs import listed_dims, load_decoys
-from api.cli.options import (
-    DEFAULT_DIM,
-    PROCESSOR,
-    Device,
-    chosen_device,
-    quick,
-)
+from api.cli.options import DEFAULT_DIM, PROCESSOR, Device, chosen_device, quick
 from api.cli.results import Plan, Result, reports
 from api.service.opening import file_sealer, open_keyring
 from api.settings import Settings

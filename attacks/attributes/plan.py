@@ -267,10 +267,10 @@ def prepare(parts: Split, *, plan: AttributePlan, generator: DecoyGenerator | No
 
 def schemes_of(
     *,
-    strategies: Iterable[str] = ("random", "adversarial", "hybrid", "hybrid+"),
-    dims: Sequence[int] = PAPER_DIMS,
-    generated_dims: Sequence[int] = OUR_DIMS,
-    axes: int | None = None,
+    strategies: Iterable[str],
+    dims: Sequence[int],
+    generated_dims: Sequence[int],
+    axes: int | None,
 ) -> tuple[Scheme, ...]:
     """Return raw embeddings, the paper's strategies with a pool, and ours with a generator.
 

@@ -66,10 +66,3 @@ def test_discriminants_are_those_of_scikit_learn() -> None:
     axis = theirs.coef_[0] / np.linalg.norm(theirs.coef_[0])
     # Ours is shrunk a little.
     assert own @ axis > 0.99
-
-
-def test_raw_embeddings_have_the_scores_and_votes() -> None:
-    raw = VICTIMS.embeddings
-    near = nearest_neighbours(raw, GALLERY.embeddings, k=20)
-    rows = features_of(raw, AXES, near, GALLERY, ks=(5,))
-    np.testing.assert_allclose(rows[:, :4], raw @ AXES.discriminants.T, atol=1e-6)
