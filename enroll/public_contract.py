@@ -75,7 +75,7 @@ class PublicContract:
         return dim or self.probe_dimensions[-1]
 
     def load_pack(self, folder: Path) -> ModelPack:
-        """Load the contract's model pack, and check that it is the one."""
+        """Load the contract's model pack, and refuse another."""
         pack = ModelPack.load(folder, threads=1, flip=bool(self.binding.preprocessing.get("flip")))
         info = pack.info
         self.binding.require_embedder(
@@ -84,7 +84,7 @@ class PublicContract:
         return pack
 
     def require_decoys(self, generator: DecoyGenerator) -> DecoyGenerator:
-        """Return the contract's own of a generator that may have more axes, or refuse it."""
+        """Reduce a generator to the contract's axes; one that is not the contract's is refused."""
         source = generator.reduced(self.binding.axes)
         self.binding.require_source(source_id=source.source_id, made_with=source.made_with)
         return source

@@ -28,7 +28,7 @@ _REMEDY = (
 )
 
 
-def remembers(generator: DecoyGenerator, embeddings: NDArray[np.floating]) -> bool:
+def was_fitted_to(generator: DecoyGenerator, embeddings: NDArray[np.floating]) -> bool:
     """Whether (N, n) unit embeddings correlate less along a generator's axes than chance has it.
 
     The mean squared correlation of two axes, times N, is 0 for the embeddings of the fit. For other
@@ -69,7 +69,7 @@ def require_others(
     names, person = np.unique(np.asarray(identities, dtype=np.str_), return_inverse=True)
     firsts = np.unique(person, return_index=True)[1]
     if isinstance(source, DecoyGenerator):
-        if any(remembers(source, rows) for rows in (embeddings, embeddings[firsts])):
+        if any(was_fitted_to(source, rows) for rows in (embeddings, embeddings[firsts])):
             raise ContractError(
                 "the decoys were made of the photos of these people, or of most of them: " + _REMEDY
             )

@@ -25,7 +25,7 @@ EXTRAS = {
     "cluster": ("distributed",),
     "postgres": ("psycopg",),
     "redis": ("redis",),
-    "torch": ("skimage", "torch"),
+    "torch": ("torch",),
 }
 """What each extra of pyproject.toml brings that the commands import."""
 

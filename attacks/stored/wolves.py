@@ -36,14 +36,14 @@ Array = NDArray[np.float64]
 
 @attack(breaks=Property.IMPERSONATION, needs=_LIFTS)
 def wolf_embedding(bed: Testbed) -> Iterator[Probes]:
-    """The mean face or a principal axis is sent: what most of the attacker's templates accept."""
+    """Of the mean face and principal axes, one that most of the attacker's own lifts accept."""
     wolves = plain_wolves(bed.gallery)
     yield Probes(wolves[_ranked(bed, wolves, bed.points)[:1]], "axes of faces")
 
 
 @attack(breaks=Property.IMPERSONATION, needs=_LIFTS)
 def lifted_wolf(bed: Testbed) -> Iterator[Probes]:
-    """Principal axes of faces are sent as a lifted probe: what most own templates accept."""
+    """Of lifted principal axes of faces, one that most of the attacker's own lifts accept."""
     if bed.lifted is None:
         return
     low, high = bed.lifted.foot_point_norm or (0.0, 1.0)

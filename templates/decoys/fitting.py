@@ -57,7 +57,7 @@ class Moments:
 
 
 def fit_moments(descriptors: NDArray[np.floating]) -> Moments:
-    """Estimate the moments of faces: of unit rows (N, n), N ≥ 100, by which they vary.
+    """Estimate the mean and the covariance of faces from unit rows (N, n), N ≥ 100.
 
     Several thousand give good decoys, and with N < n single people could be recognised in the
     result. The variance along a sample's own principal axes is biased: too large along the first,

@@ -22,7 +22,7 @@ def take_made_with(fields: dict[str, object]) -> str | None:
 
 
 def checked_made_with(value: object) -> str:
-    """Give back a ``made_with`` that is one."""
+    """Return a valid ``made_with``; refuse anything else."""
     if not isinstance(value, str) or not _SHA256_HEX.fullmatch(value):
         raise DecoyError("made_with must be 64 lower-case hexadecimal digits, or absent")
     return value

@@ -41,7 +41,7 @@ def create_private(path: Path, data: bytes) -> None:
 
 
 def refuse_another_users(path: Path) -> None:
-    """Refuse to work as root on a file, a link or in a folder of another user's, who is named."""
+    """Refuse to work as root on a file or a link, or in a folder, that another user owns."""
     if os.geteuid() == 0:
         existing = next(place for place in (path, *path.parents) if os.path.lexists(place))
         if owner := existing.lstat().st_uid:
@@ -56,11 +56,13 @@ def read_at_most(file: BinaryIO, most: int) -> bytes:
     ``file.read(most + 1)`` asks for all that memory even where the file is small: a limit of
     gigabytes then fails under a limit of the process's address space.
     """
-    data = file.read(min(os.fstat(file.fileno()).st_size, most) + 1)
+    pieces = [file.read(min(os.fstat(file.fileno()).st_size, most) + 1)]
+    size = len(pieces[0])
     # A pipe states no size, and a file may grow while it is read.
-    while len(data) <= most and (piece := file.read(min(_PIECE, most + 1 - len(data)))):
-        data += piece
-    return data
+    while size <= most and (piece := file.read(min(_PIECE, most + 1 - size))):
+        pieces.append(piece)
+        size += len(piece)
+    return b"".join(pieces)
 
 
 def read_private(path: Path, most: int, *, source: str, remedy: str, allowed: int = 0) -> bytes:

@@ -50,8 +50,8 @@ _FAR_TAIL = (
 class Keystream:
     """ChaCha20 keystream turned into samples; the only source of randomness of ``templates``.
 
-    Every template gets a stream of its own, from :meth:`fresh` or from a secret; experiments share
-    one :meth:`seeded` stream.
+    Every enrollment gets a stream of its own, from :meth:`fresh` or from a secret; experiments
+    share one :meth:`seeded` stream.
 
     Examples
     --------

@@ -193,16 +193,21 @@ class MasterKeyring:
     def seal(
         self, plaintext: bytes, *, purpose: str, bound_to: Sequence[str | bytes | int]
     ) -> bytes:
-        """Encrypt less than 2 GiB under the current key, derived for a purpose.
+        """Encrypt under the current key, derived for a purpose.
 
         The blob opens only with the same purpose, and the parts that it is bound to.
+        :class:`SealError` for 2 GiB or more, which one call of the cipher does not take.
         """
         self._follow_file()
         keys = self._keys
         header = bytes([_VERSION]) + keys.ids[0]
         nonce = os.urandom(NONCE_BYTES)
         cipher = AESGCM(keys.derived(keys.ids[0], purpose))
-        return header + nonce + cipher.encrypt(nonce, plaintext, _bind(header, purpose, bound_to))
+        try:
+            sealed = cipher.encrypt(nonce, plaintext, _bind(header, purpose, bound_to))
+        except OverflowError:
+            raise SealError("less than 2 GiB can be sealed at once: divide the file") from None
+        return header + nonce + sealed
 
     def open(self, sealed: bytes, *, purpose: str, bound_to: Sequence[str | bytes | int]) -> bytes:
         """Decrypt what :meth:`seal` made with the same purpose and parts.

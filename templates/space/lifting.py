@@ -96,9 +96,9 @@ def lift_stream(
     secret : bytes
         32 random bytes of the deployment. With these very pixels they give the decoys.
     photos : sequence of bytes
-        What was sent, in any order, however often each: decoded photos, or the bytes of embeddings.
-        Not the files: others of the same pixels give the same embedding. Nor what a model made of
-        them, which another processor rounds in another way.
+        What was sent, in any order, however often each: digests of the decoded photos, or the bytes
+        of embeddings. Not the files: others of the same pixels give the same embedding. Nor what a
+        model made of them, which another processor rounds in another way.
     holder : (tenant, subject), optional
         Whose key turns the template; not the key, which may be replaced by another one.
     """

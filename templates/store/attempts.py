@@ -3,7 +3,7 @@
 A decision reads the subject's template, compares outside of any transaction, and is recorded in one
 write, before anybody is told of it: its token is used up, the lock is checked, the failure is
 counted, the audit log gets its line. If the template is another one by then, all of it is done
-again: a few times so, and then inside the write, where nobody can replace the template.
+again. After a few times it is done inside the write, where nobody can replace the template.
 
 Counts belong to the subject, enrolled or not. A second API key therefore gives no further attempts,
 and a lock does not show whether the subject is enrolled. They live in the database only, so that
@@ -44,7 +44,7 @@ from templates.store.tenants import RetiredRotation
 COUNT_RETENTION = timedelta(days=90)
 """Time after the last failure until a count is forgotten; a disabled subject stays so."""
 TRIES = 4
-"""Times that a probe is compared outside of the write, for which all other writes would wait."""
+"""Times that a probe is compared outside of the write. Other writes wait for a comparison in it."""
 
 
 @dataclass(frozen=True)

@@ -88,8 +88,9 @@ def _last_to_go(connection: Connection, context: StoreContext, through: int | No
         AuditRow.token.is_not(None), AuditRow.at > used_since
     )
     first_use = connection.execute(query).scalar()
-    ends = [end for end in (through, first_use and first_use - 1) if end is not None]
-    return min(ends, default=None)
+    if first_use is None:
+        return through
+    return first_use - 1 if through is None else min(through, first_use - 1)
 
 
 def write_archive(

@@ -42,8 +42,7 @@ PURGE_WAIT_S = 0.25
 """Longest that emptying SQLite's log waits for readers, and so makes writers wait."""
 _UNAVAILABLE_CLASSES = {"08", "53", "57", "58"}  # connection, resources, operator, system
 _TABLE_MISSING = (
-    "a table is missing: run `veilface db upgrade`; where that changes nothing, restore a backup, "
-    "or make the database anew if an unreleased state of the program made it"
+    "a table is missing: run `veilface db upgrade`; if it is missing afterwards, restore a backup"
 )
 _LOCK_NOT_AVAILABLE, _DEADLOCK, _SERIALISATION = "55P03", "40P01", "40001"
 

@@ -190,7 +190,7 @@ class Subjects:
         return stored
 
     def record_export(self, tenant: str, subject_id: str, *, template_id: str, by: By) -> None:
-        """Write the line of an export; :class:`StoreBusy` if it is not the subject's any more."""
+        """Write the line of an export; :class:`StoreBusy` if it is no longer the subject's."""
         context = self._context
         query = select_subjects((TemplateRow.template_id,), tenant).where(
             SubjectRow.subject_id == checked_subject_id(subject_id)

@@ -22,7 +22,7 @@ from tests.api.server_process import Server
 from tests.reliability.evidence import examine, unexpected
 from tests.reliability.kill import QUIET
 from tests.reliability.load import look_at_all, make_subjects, people_of
-from tests.reliability.operations import Clients, Operation, People
+from tests.reliability.operations import LOST, NOT_SENT, Clients, Operation, People
 
 SUBJECTS = make_subjects(2)
 
@@ -118,6 +118,19 @@ def test_nothing_is_found_where_nothing_is_wrong(stopped: StoppedDeployment) -> 
     assert list(unexpected(stopped.history, lambda _: False)) == []
 
 
+def test_a_write_that_nobody_was_told_of_may_have_happened_or_not(
+    stopped: StoppedDeployment,
+) -> None:
+    happened = stopped.the("enroll")
+    happened.outcome, happened.answer = LOST, {}
+    happened.over += 1
+    never = Operation("enroll", "subject-1", 6, "000099-never", happened.started)
+    stopped.history.append(never)
+    examined = examine(stopped, list(SUBJECTS))
+    assert examined.violations == []
+    assert examined.effective == 1
+
+
 def loses_the_write(stopped: StoppedDeployment) -> None:
     stopped.execute("DELETE FROM templates", "DELETE FROM subjects")
 
@@ -126,16 +139,62 @@ def loses_half_of_it(stopped: StoppedDeployment) -> None:
     stopped.execute("DELETE FROM templates")
 
 
+def keeps_what_was_erased(stopped: StoppedDeployment) -> None:
+    with stopped.store() as store:
+        other = store.subjects.get("default", "subject-0")
+        assert other is not None
+        columns = ("contract_id", "n", "m", "dtype", "source", "photos", "template_id")
+        known = {name: getattr(other.record, name) for name in columns}
+        store.subjects.put("default", "subject-1", other.wire, **known)
+
+
+def moves_a_template(stopped: StoppedDeployment) -> None:
+    stopped.execute("UPDATE subjects SET subject_id = 'subject-1'")
+
+
 def spoils_the_template(stopped: StoppedDeployment) -> None:
     stopped.execute("UPDATE templates SET ciphertext = zeroblob(length(ciphertext))")
+
+
+def has_another_template(stopped: StoppedDeployment) -> None:
+    enrolled = [each for each in stopped.history if each.kind == "enroll"][1]
+    enrolled.answer = {**enrolled.answer, "template_id": "other"}
+    described = stopped.the("describe")
+    described.answer = {**described.answer, "template_id": "other"}
 
 
 def loses_the_receipts(stopped: StoppedDeployment) -> None:
     stopped.execute("DELETE FROM receipts")
 
 
+def forgets_a_token(stopped: StoppedDeployment) -> None:
+    stopped.execute("UPDATE audit_log SET token = NULL WHERE outcome = 'reject'")
+
+
+def lowers_a_count(stopped: StoppedDeployment) -> None:
+    stopped.execute("UPDATE failed_attempts SET consecutive = 0, total = 0")
+
+
+def counts_wrongly(stopped: StoppedDeployment) -> None:
+    stopped.execute("UPDATE failed_attempts SET consecutive = consecutive + 1")
+
+
 def alters_a_line(stopped: StoppedDeployment) -> None:
     stopped.execute("UPDATE audit_log SET outcome = 'accept' WHERE outcome = 'reject'")
+
+
+def answered_without_a_line(stopped: StoppedDeployment) -> None:
+    said = stopped.the("enroll", last=True)
+    stopped.history.append(dataclasses.replace(said, request_id="000099-unheard"))
+
+
+def wrote_what_was_refused(stopped: StoppedDeployment) -> None:
+    said = stopped.the("enroll")
+    said.outcome, said.code, said.answer = 429, "rate_limited", {}
+
+
+def wrote_what_was_not_sent(stopped: StoppedDeployment) -> None:
+    stopped.the("erase").outcome = NOT_SENT
 
 
 def wrote_what_nobody_sent(stopped: StoppedDeployment) -> None:
@@ -154,6 +213,18 @@ def accepted_who_was_replaced(stopped: StoppedDeployment) -> None:
     late.person = 1
 
 
+def repeated_another_receipt(stopped: StoppedDeployment) -> None:
+    first, second, *_, other = [each for each in stopped.history if each.kind == "erase"]
+    assert first.receipt_id == second.receipt_id
+    second.answer = other.answer
+
+
+def wrote_before_it_was_asked(stopped: StoppedDeployment) -> None:
+    said = stopped.the("enroll")
+    later = max(each.answered for each in stopped.history)
+    said.started, said.answered, said.over = later + 1, later + 2, later + 2
+
+
 def decided_twice(stopped: StoppedDeployment) -> None:
     (_, again), *_ = stopped.replays
     again.outcome, again.code = 200, None
@@ -164,12 +235,23 @@ def decided_twice(stopped: StoppedDeployment) -> None:
     [
         (loses_the_write, "not enrolled after"),
         (loses_half_of_it, "subject without a template"),
+        (keeps_what_was_erased, "subject-1: enrolled after erase"),
+        (moves_a_template, "subject-1: its template cannot be opened"),
         (spoils_the_template, "its template cannot be opened"),
+        (has_another_template, "another template than"),
         (loses_the_receipts, "receipts: none for erase"),
+        (forgets_a_token, "tokens: "),
+        (lowers_a_count, "was lowered"),
+        (counts_wrongly, "failed attempts are"),
         (alters_a_line, ": altered"),
+        (answered_without_a_line, "audit log: 0 lines"),
+        (wrote_what_was_refused, "a line for enroll"),
+        (wrote_what_was_not_sent, "a line for erase"),
         (wrote_what_nobody_sent, "which nobody sent"),
         (decided_otherwise, "another one, for verify"),
         (accepted_who_was_replaced, "no serial order"),
+        (repeated_another_receipt, "no serial order"),
+        (wrote_before_it_was_asked, "stands too late"),
         (decided_twice, "replay: 200"),
     ],
 )
@@ -179,3 +261,9 @@ def test_a_fault_is_found(
     fault(stopped)
     violations = stopped.violations()
     assert any(sentence in each for each in violations), violations
+
+
+def test_an_answer_that_should_not_be_is_found(stopped: StoppedDeployment) -> None:
+    stopped.the("verify").outcome = 500
+    (violations,) = unexpected(stopped.history, lambda each: each.outcome == 503)
+    assert "500" in violations

@@ -99,14 +99,18 @@ def match(file: EmbeddingsFile, benchmark: VerificationSet) -> NDArray[np.int64]
         pieces = _components(path)
         for start in range(len(pieces)):
             ends[pieces[start:]].append(row)
-    telling = _TELLING.get(benchmark.kind, 0)
+    telling = _TELLING.get(benchmark.kind)
+    taken: dict[int, str] = {}
     positions = np.full(len(benchmark.pictures), -1, dtype=np.int64)
     faults: list[str] = []
     for place, picture in enumerate(benchmark.pictures):
-        rows = exact.get(picture.name) or ends[_components(picture.name)[-telling:]]
+        pieces = _components(picture.name)
+        rows = exact.get(picture.name) or ends[pieces if telling is None else pieces[-telling:]]
         if len(rows) > 1:
             shown = " and ".join(f"{file.paths[row]!a}" for row in rows[:_SHOWN])
             faults.append(f"{picture.name} may be {shown}")
+        elif rows and taken.setdefault(rows[0], picture.name) != picture.name:
+            faults.append(f"{file.paths[rows[0]]!a} fits {taken[rows[0]]} and {picture.name}")
         elif rows:
             positions[place] = rows[0]
     if faults:

@@ -66,7 +66,7 @@ def contiguous_folds(pairs: int) -> Indices:
 
 
 def require_both_classes(name: str, same: Flags, folds: Indices | None) -> None:
-    """Check that there are pairs of one person and pairs of two, in every fold where there are."""
+    """Check that there are pairs of one person and pairs of two; with folds, in every fold."""
     if folds is None:
         if same.all() or not same.any():
             people = "two people" if same.any() else "one person"

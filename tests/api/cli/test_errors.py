@@ -59,7 +59,7 @@ def test_verify_does_not_fail_with_the_status_of_a_rejection(error):
 
 ROOT = Path(__file__).resolve().parents[3]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-MODULES = {"scikit-image": "skimage", "scikit-learn": "sklearn"}
+MODULES = {"scikit-learn": "sklearn"}
 
 
 def names(requirements: list[str]) -> set[str]:

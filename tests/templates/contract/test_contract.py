@@ -241,6 +241,19 @@ def test_the_calibration_of_the_most_photos_that_are_not_more_serves() -> None:
         contract.calibration("p2s", probe_photos=0)
 
 
+def test_the_embedding_id_names_the_weights_and_the_preprocessing() -> None:
+    binding = make_binding()
+    text = json.dumps(
+        {"embedder_sha256": "ab" * 32, "preprocessing": dict(binding.preprocessing)},
+        sort_keys=True,
+        separators=(",", ":"),
+    )
+    assert binding.embedding_id == hashlib.sha256(text.encode()).hexdigest()
+    assert make_binding(m=2).embedding_id == binding.embedding_id
+    assert make_binding(preprocessing={"flip": 1}).embedding_id != binding.embedding_id
+    assert make_binding(embedder_sha256="ef" * 32).embedding_id != binding.embedding_id
+
+
 def test_mismatches_name_both_sides() -> None:
     binding = make_binding()
     same = {"embedder_sha256": "ab" * 32, "preprocessing": dict(binding.preprocessing), "n": N}

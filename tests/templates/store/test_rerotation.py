@@ -23,7 +23,7 @@ from templates.store.audit_log import By
 from templates.store.schema import RotationKeyRow, SubjectRow, TemplateRow
 from templates.store.tenants import RetiredRotation
 from tests.patience import PATIENCE_S
-from tests.templates.store.conftest import Clock, SlowSealing
+from tests.templates.store.conftest import Clock, SlowSealing, found, pieces
 from tests.templates.store.test_attempts import Says, decide
 
 N, M = 48, 4
@@ -257,7 +257,7 @@ def test_a_move_has_its_line_and_takes_back_no_decision(store: TemplateStore) ->
     assert calls == [3]
 
 
-def test_what_is_left_is_named_in_pages(store: TemplateStore) -> None:
+def test_what_is_left_is_named(store: TemplateStore) -> None:
     people = People(store, 5)
     for name in people.names:
         people.enroll(name)
@@ -389,3 +389,32 @@ def test_an_enrollment_under_way_is_waited_for_before_a_key_goes(
     assert epochs(store) == [2]
     assert people.misses().max() < 1e-3
     service.close()
+
+
+def test_sqlite_files_keep_nothing_of_the_old_rotation(
+    tmp_path: Path, keyring: MasterKeyring
+) -> None:
+    folder = tmp_path / "data"
+    folder.mkdir()
+    store = TemplateStore(f"sqlite:///{folder / 'veilface.db'}", keyring)
+    store.upgrade()
+    store.tenants.create("default")
+    people = People(store, 12)
+    for name in people.names:
+        people.enroll(name)
+    row = rows(store)["s007"]
+    key = store.database.read(
+        lambda each: each.execute(sa.select(RotationKeyRow.wrapped_key)).scalar_one()
+    )
+    ciphertext = pieces(row["templates.ciphertext"])
+    data_key, rotation_key = pieces(row["subjects.wrapped_key"][9:]), pieces(key[9:])
+    assert max(found(folder, ciphertext).values()) >= 0.9 * len(ciphertext)
+    assert found(folder, data_key) != {}
+    assert found(folder, rotation_key) != {}
+    store.rerotation.begin("default")
+    store.rerotation.move("default", people.binding, batch=5)
+    assert found(folder, ciphertext) == {}
+    assert found(folder, data_key) == {}
+    store.rerotation.retire("default")
+    assert found(folder, rotation_key) == {}
+    store.close()

@@ -78,7 +78,7 @@ class VerifiedSet:
 
     scored: ScoredSet
     matched: Flags = field(repr=False)  # (k,)
-    # (k,): of people who are enrolled, and not by this photo. One without a face is shown too.
+    # (k,): photos of enrolled people, with or without a face, but not those of the enrollment.
     tried: Flags = field(repr=False)
     level: str
     target_fmr: float | None

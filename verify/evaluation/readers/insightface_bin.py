@@ -115,6 +115,8 @@ class _Array:
 
     def __setstate__(self, state: Any) -> None:
         _, self.shape, kind, _, content = state
+        if not isinstance(self.shape, tuple) or not all(isinstance(n, int) for n in self.shape):
+            raise pickle.UnpicklingError("an array has no shape")
         self.values = content if isinstance(content, list) else np.frombuffer(content, kind.code)
 
     def listed(self) -> list[Any] | None:
@@ -124,7 +126,11 @@ class _Array:
     def row(self) -> bytes | None:
         """Return the bytes of a row, or a column, of uint8."""
         is_row = isinstance(self.values, np.ndarray) and self.values.dtype == np.uint8
-        return self.values.tobytes() if is_row and max(self.shape) == len(self.values) else None
+        return (
+            self.values.tobytes()
+            if is_row and max(self.shape, default=0) == len(self.values)
+            else None
+        )
 
 
 def _filled(raw: bytes, kind: _Type, shape: Any, _: Any) -> _Array:

@@ -92,7 +92,7 @@ def _fault_of(row: dict[str, str]) -> str | None:
 def _from_zero(path: Path, trials: Sequence[Trial]) -> list[Trial]:
     """Number the folds from 0."""
     folds = sorted({trial.fold for trial in trials if trial.fold is not None})
-    if folds and len(folds) != FOLDS:
+    if folds and folds != [*range(folds[0], folds[0] + FOLDS)]:
         raise DatasetError(f"{path} has {len(folds)} folds; number ten of them 1 to 10, or 0 to 9")
     return [
         replace(trial, fold=None if trial.fold is None else folds.index(trial.fold))
