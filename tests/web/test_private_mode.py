@@ -342,7 +342,7 @@ def test_what_keeps_private_mode_from_working_is_said_and_nothing_else_is_sent(
     tab.choose_files(people[WHO][0])
     tab.press("Verify")
     alert = page.get_by_role("alert")
-    expect(alert).to_contain_text("is not the one that was asked for")
+    expect(alert).to_contain_text("use the pack that the contract was calibrated with")
     expect(alert).to_contain_text("private_mode")
     calls, rest = requests_in(recording.sent)
     assert rest == 0
