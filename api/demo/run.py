@@ -271,7 +271,8 @@ def _attempts(
 ) -> list[_Attempt]:
     """Show every probe photo to every enrolled subject, at every level.
 
-    Somebody who was not enrolled, and a photo that cannot be used, count as rejected.
+    Somebody who was not enrolled, and a photo that cannot be used, count as rejected. The failed
+    attempts on a subject are forgotten at the end: `veilface serve` would take them for a lock.
     """
     probes = [
         (name, photo)
@@ -297,6 +298,8 @@ def _attempts(
                 else:
                     refused.append(f"{owner}/{photo.name}: {_code(answer)}")
                 attempts.append(_Attempt(subject, owner == subject, level, accepted))
+    for subject in enrolled:
+        client.delete(f"/v1/subjects/{subject}/lockout").raise_for_status()
     return attempts
 
 

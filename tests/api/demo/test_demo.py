@@ -69,6 +69,9 @@ def test_the_folder_is_ready_for_serve(played):
     assert token.startswith("vf_")
     assert token not in (folder / "serve.log").read_text()
     assert sorted(path.name for path in (folder / "people").iterdir())[0] == "person-1"
+    # What the demo tried locks nobody whom the service finds there.
+    options = ("--data-dir", folder, "--master-key-file", folder / "master.key")
+    assert "no failed attempts" in run("db", "unlock", "person-2", *options).stderr
 
 
 @pytest.mark.long
