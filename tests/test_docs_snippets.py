@@ -5,8 +5,11 @@ clients and the examples in tests of their own.
 """
 
 import json
+import os
 import re
 import shlex
+import shutil
+import subprocess
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,11 +20,14 @@ import pytest
 import typer
 import typer.main
 import yaml
+from cryptography import x509
 
 from api.cli.app import COMMANDS, app, load
 from api.settings import Settings
 from models.pack_file import read_pack_file
+from tests.certificates import self_signed
 from tests.pages import FENCED, ROOT, Snippet, pages, snippets
+from tests.ports import free_port
 from verify.evaluation.embeddings_file import read_embeddings
 
 PUNCTUATION = set("();<>|&")
@@ -145,6 +151,32 @@ def test_toml_is_read(snippet: Snippet, tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.chdir(tmp_path)
     assert set(values) <= set(Settings.model_fields)
     Settings(**values)
+
+
+@of_kind("nginx")
+def test_nginx_accepts_it(snippet: Snippet, tmp_path: Path) -> None:
+    if shutil.which("nginx") is None:
+        if os.environ.get("VEILFACE_REQUIRE_NGINX") == "1":
+            pytest.fail("nginx is not installed, and VEILFACE_REQUIRE_NGINX=1 asks for it")
+        pytest.skip("nginx is not installed")
+    certificate, _ = self_signed(tmp_path, host=x509.DNSName("faces.example.org"))
+    certificate.rename(tmp_path / "chain.pem")
+    block = snippet.code.replace("/etc/ssl/faces/", f"{tmp_path}/")
+    block = block.replace("listen 443 ssl", f"listen 127.0.0.1:{free_port()} ssl")
+    kept = "".join(
+        f"{name}_temp_path {tmp_path}/{name};\n"
+        for name in ("client_body", "proxy", "fastcgi", "uwsgi", "scgi")
+    )
+    path = tmp_path / "nginx.conf"
+    path.write_text(
+        f"pid {tmp_path}/pid;\nevents {{}}\nhttp {{\naccess_log off;\n{kept}{block}}}\n"
+    )
+    done = subprocess.run(
+        ["nginx", "-t", "-q", "-p", tmp_path, "-c", path, "-e", tmp_path / "error.log"],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
 
 
 def test_the_embeddings_file_of_the_page_is_read(
