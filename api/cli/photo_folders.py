@@ -1,5 +1,6 @@
 """Folders of photos that bulk commands are given; what is not read of them is named."""
 
+import csv
 import unicodedata
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -48,28 +49,45 @@ def labelled_people(folder: Path) -> LabelledFolder:
     return replace(labelled, paths=paths, identities=identities)
 
 
-def albums_of(folder: Path) -> tuple[dict[str, list[Path]], dict[str, str]]:
-    """Photos by subject id, of ``folder/Person/photo.jpg``; and why others cannot be enrolled.
+def albums_of(source: Path) -> tuple[dict[str, list[Path]], dict[str, str]]:
+    """Photos by subject id, and why others cannot be enrolled.
 
-    Names that are spellings of one id are one person.
+    Of ``source/Person/photo.jpg``, or of a CSV file with the columns ``subject`` and ``photo``, a
+    path relative to the file. Names that are spellings of one id are one person.
     """
     # Imported here: most commands that read folders open no store, which takes seconds to load.
     from templates.store.identifiers import InvalidIdentifier, checked_subject_id
 
-    if not folder.is_dir():
-        raise UsageError(f"{folder} is not a folder")
+    if source.is_dir():
+        labelled = labelled_people(source)
+        named = list(zip(labelled.identities, labelled.paths, strict=True))
+    else:
+        named = _listed_photos(source)
     albums: dict[str, list[Path]] = {}
     left_out: dict[str, str] = {}
-    labelled = labelled_people(folder)
-    for name, photo in zip(labelled.identities, labelled.paths, strict=True):
+    for name, photo in named:
         try:
             albums.setdefault(checked_subject_id(name), []).append(photo)
         except InvalidIdentifier as error:
             left_out[name] = str(error)
-    for entry in visible(folder):
+    for entry in visible(source) if source.is_dir() else ():
         if entry.is_dir() and unicodedata.normalize("NFC", entry.name) not in albums:
             left_out.setdefault(entry.name, f"no photo that is read: photos end in {_ENDINGS}")
     return albums, left_out
+
+
+def _listed_photos(file: Path) -> list[tuple[str, Path]]:
+    """Read the people and photos of a CSV file."""
+    try:
+        with file.open(encoding="utf-8-sig", newline="") as stream:
+            rows = list(csv.DictReader(stream))
+    except FileNotFoundError:
+        raise UsageError(f"{file} is neither a folder nor a CSV file") from None
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise UsageError(f"{file} cannot be read as CSV: {error}") from None
+    if not rows or not all(row.get("subject") and row.get("photo") for row in rows):
+        raise UsageError(f"{file} needs the columns subject,photo, and both on every line")
+    return [(row["subject"], file.parent / row["photo"]) for row in rows]
 
 
 def people_or_faces(folder: Path) -> LabelledFolder:

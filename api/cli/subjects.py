@@ -57,7 +57,8 @@ def enroll(
             "--from",
             metavar="PEOPLE",
             help="Enroll many: a folder with a subfolder of photos for each person, whose name is "
-            f"the id. At most {MAX_PHOTOS} photos of each are taken.",
+            "the id, or a CSV file `subject,photo`, with paths relative to it. At most "
+            f"{MAX_PHOTOS} photos of each are taken.",
         ),
     ] = None,
     tenant: Tenant = DEFAULT_TENANT,

@@ -43,7 +43,8 @@ def test_enroll_then_accept_and_reject(world, veilface):
     assert again.json["replaced"] is True
 
 
-def test_many_are_enrolled_and_who_is_not_is_named(world, veilface, tmp_path):
+@pytest.mark.parametrize("listed", [False, True])
+def test_many_are_enrolled_and_who_is_not_is_named(world, veilface, tmp_path, listed):
     people = tmp_path / "people"
     shutil.copytree(world.people, people)
     (people / "person-2" / "0.png").write_bytes(b"no picture")
@@ -53,7 +54,13 @@ def test_many_are_enrolled_and_who_is_not_is_named(world, veilface, tmp_path):
     (people / "person-1").rename(people / "Zo\N{LATIN SMALL LETTER E WITH DIAERESIS}")
     (people / "Zoe\N{COMBINING DIAERESIS}").mkdir()
     shutil.copy(people / "Zo\xeb" / "2.png", people / "Zoe\N{COMBINING DIAERESIS}" / "9.png")
-    ran = veilface("enroll", "--from", people, "--pack", world.pack, "--json")
+    source = people
+    if listed:
+        source = tmp_path / "people.csv"
+        photos = (photo.relative_to(tmp_path) for photo in sorted(people.glob("*/*.png")))
+        lines = (f"{photo.parent.name},{photo}" for photo in photos)
+        source.write_text("\n".join(["subject,photo", *lines, ""]), encoding="utf-8")
+    ran = veilface("enroll", "--from", source, "--pack", world.pack, "--json")
     assert ran.status == 1, ran.stderr
     assert ran.json["tenant"] == "default"
     enrolled = {one["subject_id"]: one["photos"] for one in ran.json["enrolled"]}
@@ -118,6 +125,8 @@ def test_many_are_enrolled_and_all_is_well(world, veilface):
 def test_what_stands_in_the_way_is_named(world, veilface, tmp_path):
     broken = tmp_path / "broken.png"
     broken.write_bytes(b"no picture")
+    no_value = tmp_path / "value.csv"
+    no_value.write_text("subject,photo\nann,\n")
     photo = world.photos(1, range(1))
     pack = ("--pack", world.pack)
     cases = [
@@ -129,7 +138,8 @@ def test_what_stands_in_the_way_is_named(world, veilface, tmp_path):
         (("enroll", "ann", *photo), 2, "--pack"),
         (("enroll", "ann"), 2, "or many people with --from"),
         (("enroll", "ann", *photo, "--from", tmp_path, *pack), 2, "no SUBJECT"),
-        (("enroll", "--from", tmp_path / "absent", *pack), 2, "is not a folder"),
+        (("enroll", "--from", tmp_path / "absent", *pack), 2, "neither a folder nor"),
+        (("enroll", "--from", no_value, *pack), 2, "both on every line"),
         (("enroll", "--from", tmp_path, *pack), 1, "no photo in a person's folder"),
     ]
     for arguments, status, said in cases:
