@@ -36,7 +36,7 @@
 
 Each is defined here, or next to what raises it: [1] ``templates.store.identifiers``,
 [3] ``templates.space.agreement``, [4] ``verify.datasets``,
-[5] ``verify.evaluation.plan``, [6] ``verify.evaluation.cluster``, [7] ``attacks.errors``,
+[5] ``verify.evaluation.plan``, [6] ``verify.evaluation.cluster``, [7] ``attacks.outcomes``,
 [8] ``api.http.errors``, [9] ``verify.preparation``, [10] ``api.cli.errors``,
 [11] ``templates.store.tenants``, [12] ``templates.store.lockout``,
 [13] ``templates.store.audit_log``, [17] ``templates.store.subjects``.

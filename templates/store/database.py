@@ -11,6 +11,7 @@ import sqlite3
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any, TypeVar
 
 import sqlalchemy as sa
@@ -81,7 +82,11 @@ class Database:
             self.url, timeout=timeout, pool_size=pool_size, max_overflow=max_overflow
         )
         self._readers = self.engine
-        if not self.is_sqlite:
+        self._opened = _identity(self._file)
+        if self.is_sqlite:
+            # SQLite would make an empty file, and the connection would stay with that one.
+            sa.event.listen(self.engine, "do_connect", lambda *_: self._require_file())
+        else:
             self._readers = self.engine.execution_options(isolation_level="AUTOCOMMIT")
 
     def read(self, work: Callable[[Connection], T]) -> T:
@@ -103,6 +108,7 @@ class Database:
         with _translating(), engine.connect() as connection:
             if self.is_sqlite:
                 _driver(connection).execute("BEGIN")
+                self._require_file()
             return work(connection)
 
     def write(self, work: Callable[[Connection], T], *, wait: float | None = None) -> T:
@@ -122,6 +128,7 @@ class Database:
             if self.is_sqlite:
                 with self._turn(until), self._patience(connection, until) as driver:
                     driver.execute("BEGIN IMMEDIATE")
+                self._require_file()
             else:
                 connection.execute(_BEGIN_WRITE, {"limit": str(round(1000 * wait))})
             return work(connection)
@@ -199,8 +206,24 @@ class Database:
         finally:
             driver.execute(_busy_timeout(self._timeout))
 
+    def _require_file(self) -> None:
+        """Refuse to go on with a file that was moved or removed: its writes would go with it."""
+        if _identity(self._file) != self._opened:
+            raise StoreUnavailable(
+                "the database file was removed or replaced while it was open: put it back, or stop "
+                "the service first and start it again"
+            )
+
     def __repr__(self) -> str:
         return f"Database({self.url.render_as_string(hide_password=True)!r})"
+
+
+def _identity(file: Path | None) -> tuple[int, int] | None:
+    try:
+        status = None if file is None else file.stat()
+    except OSError:
+        return None
+    return None if status is None else (status.st_dev, status.st_ino)
 
 
 def _busy_timeout(seconds: float) -> str:

@@ -257,6 +257,24 @@ def test_a_write_waits_for_one_that_hangs_no_longer_than_the_timeout(
     store.close()
 
 
+def test_nothing_is_written_to_a_file_that_was_removed(
+    tmp_path: Path, keyring: MasterKeyring
+) -> None:
+    path, aside = tmp_path / "veilface.db", tmp_path / "aside.db"
+    store = TemplateStore(f"sqlite:///{path}", keyring)
+    store.upgrade()
+    path.rename(aside)
+    for replaced in (False, True):
+        if replaced:
+            path.touch()
+        for work in (store.ping, lambda: store.tenants.create("default")):
+            with pytest.raises(StoreUnavailable, match="removed or replaced"):
+                work()
+    aside.rename(path)
+    assert store.tenants.create("default")
+    store.close()
+
+
 def test_a_full_disk_is_said_and_harms_nothing(tmp_path: Path, keyring: MasterKeyring) -> None:
     """SQLite's page limit gives the same error as a full disk (SQLITE_FULL)."""
     store = TemplateStore(f"sqlite:///{tmp_path / 'veilface.db'}", keyring, pool_size=1)
