@@ -189,6 +189,7 @@ def test_a_decision_that_cannot_be_recorded_is_not_told(
         patch.setattr(log, "append", full)
         for method, path, options in (
             ("POST", "/v1/subjects/alice/verify", {"files": images(photo(1, 4), name="image")}),
+            ("POST", "/v1/compare", {"files": images(photo(1), photo(1, 4))}),
             ("PUT", "/v1/subjects/alice/enrollment", {"files": images(photo(2))}),
             ("DELETE", "/v1/subjects/alice", {}),
             ("GET", "/v1/subjects/alice/export", {}),

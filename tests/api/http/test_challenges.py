@@ -14,6 +14,7 @@ from api.http.errors import StartError
 from api.http.routes import challenges
 from api.service.runtime import Runtime
 from models.pack import ModelPack
+from templates.store.lockout import LockoutPolicy
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, deploy, images, photo
 from tests.api.living import (
@@ -27,8 +28,8 @@ from tests.api.living import (
     liveness,
 )
 from tests.api.shapes import assert_error
-from tests.heads import performed
-from tests.marked_heads import frame, write_marked_pack
+from tests.heads import POSES, head, performed
+from tests.marked_heads import draw, encoded, frame, write_marked_pack
 
 Service = tuple[Client, Deployment]
 
@@ -96,6 +97,28 @@ def test_a_challenge_is_good_for_one_decision(active: Service) -> None:
     still = answered(client, asked["challenge_id"], frames_of(["front"] * 5), headers=other)
     assert liveness(still)[:3] == failed("")[:3]
     assert_error(answered(client, asked["challenge_id"], frames), 401, "replayed")
+
+
+def test_a_photo_that_fails_leaves_the_challenge_good(active: Service) -> None:
+    client, _ = active
+    asked = challenge(client)
+    frames = frames_of(performed(asked["movements"]))
+    faceless = encoded(draw(head(**POSES["front"]), marked=False))
+    answer = answered(client, asked["challenge_id"], [*frames[:5], faceless])
+    assert assert_error(answer, 422, "no_face")["image"] == 5
+    assert liveness(answered(client, asked["challenge_id"], frames)) == PASSED
+
+
+def test_a_failed_challenge_counts_for_the_lockout(
+    tmp_path: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("api.service.opening.LOCKOUT", LockoutPolicy(first_s=3600))
+    for client, _ in serve(tmp_path, liveness="active", lockout_after=1):
+        told = answered(client, challenge(client)["challenge_id"], frames_of(["front"] * 5))
+        assert liveness(told) == failed("no_turn")
+        asked = challenge(client)
+        frames = frames_of(performed(asked["movements"]))
+        assert_error(answered(client, asked["challenge_id"], frames), 423, "locked_out")
 
 
 def test_why_is_told_to_keys_with_scores_only(active: Service) -> None:

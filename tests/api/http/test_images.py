@@ -136,6 +136,20 @@ def test_scenes_without_one_usable_face(real: Client, faces: list[np.ndarray[Any
     assert failures(real, list(scenes(faces[0], faces[1]))) == []
 
 
+def test_the_largest_face_is_taken_when_asked_for(
+    real: Client, faces: list[np.ndarray[Any, Any]]
+) -> None:
+    height, width = faces[0].shape[:2]
+    small = np.asarray(Image.fromarray(faces[1]).resize((width * 4 // 5, height * 4 // 5)))
+    scene = np.full((height * 5 // 2, width * 5 // 2, 3), 127, np.uint8)
+    top, left = height * 3 // 4, width * 3 // 4
+    scene[top : top + height, left : left + width] = faces[0]
+    scene[: small.shape[0], : small.shape[1]] = small
+    data = encoded(scene)
+    assert code_of(verify(real, data)) == "multiple_faces"
+    assert verify(real, data, data={"face": "largest"}).json()["decision"] == "accept"
+
+
 @pytest.mark.long
 def test_enrolling_awkward_photos_changes_nothing(
     real: Client, faces: list[np.ndarray[Any, Any]]

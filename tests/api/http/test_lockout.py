@@ -178,7 +178,7 @@ def test_a_disabled_subject_waits_for_an_operator(
 
 @pytest.mark.parametrize("scores", [True, False])
 def test_hill_climbing_ends_at_the_lockout(both: tuple[Client, Deployment], scores: bool) -> None:
-    """The climber of the audit, over REST: it gets five answers, and none of them is an accept."""
+    """A hill climber gets five answers over REST, and none of them is an accept."""
     client, deployment = both
     enroll(client)
     token = deployment.key("verify", "embeddings", *(["scores", "enroll"] if scores else []))

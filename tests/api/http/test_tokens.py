@@ -282,6 +282,20 @@ def test_a_token_is_good_for_one_embedding_or_template(shared: Service) -> None:
         assert_error(client.post(path, json=sent, headers=headers), 401, "replayed")
 
 
+def test_embeddings_need_the_right_of_the_key(shared: Service) -> None:
+    client, deployment = shared
+    numbers = client.app.state.runtime.pack.embed_photo(photo(1, 5)).embedding.tolist()
+    template = b64(probe(deployment, numbers))
+    for action, call, method, sent in (
+        ("verify", "verify", "POST", {"embedding": numbers}),
+        ("enroll", "enrollment", "PUT", {"template": template}),
+    ):
+        token = issue(client, action, headers=bearer(deployment.key(action)))["token"]
+        path = f"/v1/subjects/alice/{call}"
+        refused = client.request(method, path, json=sent, headers=bearer(token))
+        assert assert_error(refused, 403, "forbidden") == {"missing": ["embeddings"]}
+
+
 def test_a_theft_of_an_answered_request_gives_nothing(service: Service) -> None:
     client, _ = service
     used, writing = issue(client)["token"], issue(client, "enroll", "carol")["token"]
@@ -317,6 +331,9 @@ def test_a_theft_of_an_earlier_request_gives_the_one_call(shared: Service) -> No
     token, writing = issue(client)["token"], issue(client, "enroll", "erin")["token"]
     for held in (token, writing):
         assert client.get("/v1/contract", headers=bearer(held)).status_code == 200
+    no_photo = images(b"no photo", name="image")
+    refused = client.post("/v1/subjects/alice/verify", files=no_photo, headers=bearer(token))
+    assert_error(refused, 400, "unsupported_image")
     refused = client.put(
         "/v1/subjects/erin/enrollment", files=images(photo(3), photo(4)), headers=bearer(writing)
     )

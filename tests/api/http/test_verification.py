@@ -1,15 +1,18 @@
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from api.http.app import create_app
 from api.http.schemas import VerifyAnswer
 from templates.contract import wire
+from templates.keys.sealing import MasterKeyring
 from templates.space.subspace import SubspaceBatch
 from tests.api.calls import ask, b64, embedding, probe
 from tests.api.client import Client
-from tests.api.deployment import AXES, PROBE_M, Deployment, N, images, photo
+from tests.api.deployment import AXES, PROBE_M, Deployment, N, bearer, deploy, images, photo
 from tests.api.shapes import assert_answer, assert_error
 
 PRODUCT_KEYS = {
@@ -240,3 +243,18 @@ def test_fields_are_checked(client: Client, sender: str) -> None:
     ]
     for case in cases:
         assert_error(ask(client, sender, **case), 422, "validation_failed")
+
+
+def test_a_retired_master_key_does_not_tell_who_is_enrolled(tmp_path: Path) -> None:
+    own = deploy(tmp_path)
+    with Client(create_app(own.settings), headers=bearer(own.token)) as client:
+        assert client.put("/v1/subjects/a/enrollment", files=images(photo(1))).status_code == 201
+        path = own.settings.resolved_master_key_file
+        current = MasterKeyring.add_current(path)
+        client.app.state.runtime.store.wrapped_keys.rewrap()
+        MasterKeyring.drop_retired(path, keep=current)
+        token = own.key("verify")
+        for subject, decision in (("a", "accept"), ("nobody", "reject")):
+            answer = ask(client, token, subject, files=images(photo(1, 4), name="image"))
+            assert answer.status_code == 200, answer.text
+            assert answer.json()["decision"] == decision

@@ -195,6 +195,12 @@ def test_a_long_row_of_failures_does_not_overflow(clock: Clock) -> None:
     assert locked.locked_until == clock.time + timedelta(hours=1)
 
 
+def test_without_a_lockout_nothing_locks(clock: Clock) -> None:
+    never, locked = LockoutPolicy(after=0), LockoutPolicy().status(50, 50, clock.time)
+    assert never.status(50, 50, clock.time) == AttemptsStatus(50, 50, clock.time, None, None)
+    never.refuse_locked(locked, clock.time)  # which an earlier setting left
+
+
 # --- reset, erasure, expiry ----------------------------------------------------------------
 
 
