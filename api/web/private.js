@@ -199,7 +199,12 @@ async function lifted(client, action, photos, face, until) {
     const given = { face: face || undefined };
     const lift = action === "enroll" ? client.liftEnrollment(photos, given) : client.lift(photos, given);
     lifts.set(all, lift);
-    lift.catch(() => lifts.get(all) === lift && lifts.delete(all));
+    lift.catch(() => {
+      if (lifts.get(all) !== lift) return;
+      lifts.delete(all);
+      const rest = new Set([...lifts.keys()].flatMap((key) => JSON.parse(key)));
+      for (const name of names) if (!rest.has(name)) purposes.delete(name);
+    });
   }
   const lift = await lifts.get(all);
   until.throwIfAborted();

@@ -8,7 +8,7 @@ const REMEDIES = {
   unauthorized: "Check the API key: it may be mistyped, revoked or expired.",
   not_enrolled: "Check the id, or enroll the person first.",
   not_found: "The service has nothing at this address. It may have been updated: reload the page.",
-  contract_mismatch: "This person was enrolled under an earlier contract. Enroll them again; if that does not help, reload the page.",
+  contract_mismatch: "Reload the page and try again. If that does not help, this person was enrolled under an earlier contract: enroll them again.",
   unsupported_image: "Send a JPEG, PNG or WebP photo.",
   image_too_large: "Send a smaller photo.",
   request_too_large: "Send fewer or smaller photos.",
