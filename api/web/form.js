@@ -18,7 +18,7 @@ export function photoForm(id, view) {
   const why = whyOff(action);
   const on = why === null;
   const ended = new AbortController();
-  const subject = subjectField(id, action, (person) => holder.known(person), ended.signal);
+  const subject = subjectField(id, action, (person) => holder.showLock(person), ended.signal);
   const problem = h("div", {});
   const result = h("div", { class: "result", role: "status" });
   const progress = h("div", { class: "progress", role: "status" });
@@ -110,7 +110,7 @@ export function photoForm(id, view) {
     let answer = null;
     let failure = null;
     try {
-      await subject.settled();
+      await subject.searched();
       const holder_key = await holder.key(name, say);
       if (moving()) given = await view.movements.frames(name);
       answer = await view.send(name, { ...given, holder_key }, tools);

@@ -9,30 +9,31 @@ const WORDS = {
   verify: ["Use the passkey", "Your browser asks for the passkey that the enrollment is locked to."],
 };
 
-// The switch for an enrollment, which makes the passkey first, or for a verification, which `known` sets where this key
-// may know whether a person's enrollment is locked.
+// The switch for an enrollment, which makes the passkey first, or for a verification, which `showLock` sets where this
+// key may know whether a person's enrollment is locked.
 export function holderKey(action, onchange) {
   const [label, hint] = WORDS[action];
   const off = session.client
     ? session.client.whyNoPasskey()
     : "Passkeys are not offered: this service was installed without the client that they need (make javascript).";
   const ended = new AbortController();
-  const told = h("p", { class: "hint", id: newId("holder"), role: "status" }, off ?? hint);
+  const note = h("p", { class: "hint", id: newId("holder"), role: "status" }, off ?? hint);
   const box = h("input", {
     type: "checkbox",
     id: newId("holder"),
     disabled: Boolean(off),
-    "aria-describedby": told.id,
+    "aria-describedby": note.id,
     onchange,
   });
   // Another attempt to enroll takes the same passkey.
   let made = null;
 
-  function known(person) {
+  function showLock(person) {
     if (action !== "verify") return;
     const locked = person?.holder_key ?? false;
-    box.checked = locked && !off;
-    told.textContent = `${locked ? "This enrollment is locked to a holder key. " : ""}${off ?? hint}`;
+    // About a person who is not enrolled, the visitor's choice stands.
+    if (person) box.checked = locked && !off;
+    note.textContent = `${locked ? "This enrollment is locked to a holder key. " : ""}${off ?? hint}`;
     // What is set by itself is not left folded away.
     if (locked) box.closest("details")?.setAttribute("open", "");
   }
@@ -52,5 +53,5 @@ export function holderKey(action, onchange) {
   }
 
   const check = h("p", { class: "check" }, box, h("label", { for: box.id }, label));
-  return { parts: [check, told], known, key, stop: () => ended.abort() };
+  return { parts: [check, note], showLock, key, stop: () => ended.abort() };
 }

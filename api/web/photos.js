@@ -52,7 +52,7 @@ export function photoPicker({ most, replaces = false, shutter = false, onchange,
     }
   }
 
-  // What is no picture, such as a key file, is not sent to the service to find that out.
+  // What is no picture, such as a document, is not sent to the service to find that out.
   function takeFiles(files) {
     const pictures = [...files].filter((file) => file.type.startsWith("image/"));
     const others = [...files].filter((file) => !pictures.includes(file));

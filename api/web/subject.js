@@ -41,8 +41,8 @@ export const switchOf = (mode) =>
   mode?.root ??
   offNote(LIFTS && !session.mode && "Private mode could not be loaded: photos are sent to the service. Reload the page.");
 
-// `input`, its `part` of the form, `id()` in the form in which the service keeps it, and `settled()`, which waits for the
-// search that goes on. `onperson` is called with the person who is enrolled under the id, or null. Searches end with `until`.
+// `input`, its `part` of the form, `id()` in the form in which the service keeps it, and `searched()`, which waits
+// for the search that goes on. `onperson` is called with the person who is enrolled under the id, or null. Searches end with `until`.
 export function subjectField(id, action, onperson, until) {
   const searches = may("enroll");
   const list = h("datalist", { id: newId("people") });
@@ -60,7 +60,7 @@ export function subjectField(id, action, onperson, until) {
   const part = field("Person’s id", input);
   // However it was typed, a passkey of it is the same.
   const typedId = () => input.value.normalize("NFC");
-  if (!searches) return { input, part, id: typedId, settled: async () => {} };
+  if (!searches) return { input, part, id: typedId, searched: async () => {} };
   let running = new AbortController();
   let timer = 0;
   let searching = null;
@@ -104,12 +104,12 @@ export function subjectField(id, action, onperson, until) {
   until.addEventListener("abort", stop);
   part.append(list, status);
   if (id) searching = search();
-  async function settled() {
+  async function searched() {
     if (timer) {
       clearTimeout(timer);
       searching = search();
     }
     await searching;
   }
-  return { input, part, id: typedId, settled };
+  return { input, part, id: typedId, searched };
 }
