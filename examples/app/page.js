@@ -18,7 +18,7 @@ async function own(path, body) {
 defineLogin();
 const login = document.createElement("veilface-login");
 login.options = { runtime: ort };
-// Who is let in says the server.
+// The server says who is let in.
 login.words = { accept: "", enrolled: "" };
 let attempts = 0; // and preparations of one: each takes a token
 login.authorize = () => {
