@@ -40,6 +40,8 @@ def obtained(source: str, into: Path, *, sha256: str | None) -> tuple[str, int]:
         if _is_address(source):
             _download(source, draft, is_pinned=sha256 is not None)
         elif Path(source).is_file():
+            if Path(source).stat().st_size > MAX_FILE_BYTES:
+                raise _too_large(source)
             shutil.copyfile(source, draft.name)
         else:
             raise CommandError(f"{shown(source)} is neither an http(s) address nor a file")
@@ -68,6 +70,10 @@ def _is_address(source: str) -> bool:
     return source.startswith(("http://", "https://"))
 
 
+def _too_large(source: str) -> CommandError:
+    return CommandError(f"{shown(source)} is larger than {MAX_FILE_BYTES:,} bytes: not a pack")
+
+
 def _download(source: str, draft: IO[bytes], *, is_pinned: bool) -> None:
     try:
         with httpx.stream("GET", source, follow_redirects=True, timeout=TIMEOUT_S) as answer:
@@ -85,9 +91,7 @@ def _download(source: str, draft: IO[bytes], *, is_pinned: bool) -> None:
             with download("fetching", int(size) if size.isdecimal() else None) as advance:
                 for piece in answer.iter_bytes(2**18):
                     if draft.tell() + len(piece) > MAX_FILE_BYTES:
-                        raise CommandError(
-                            f"{shown(source)} is larger than {MAX_FILE_BYTES:,} bytes: not a pack"
-                        )
+                        raise _too_large(source)
                     draft.write(piece)
                     advance(len(piece))
     except (httpx.HTTPError, httpx.InvalidURL, ValueError) as error:

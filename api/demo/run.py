@@ -8,7 +8,9 @@ What is printed is computed from the answers and from the database's file; :attr
 holds whatever did not go as promised.
 """
 
+import contextlib
 import shutil
+import sqlite3
 import tempfile
 import time
 from collections.abc import Callable, Sequence
@@ -120,11 +122,29 @@ def run_demo(
         return _play(client, folder, pack, contract, cast, say=say, started=started)
 
 
+def _require_unserved(folder: Path) -> None:
+    """Refuse to remove a database that a service has open: it would go on as if it were there."""
+    path = folder / "veilface.db"
+    if not path.exists():
+        return
+    with contextlib.closing(sqlite3.connect(path, timeout=0)) as database:
+        try:
+            # SQLite leaves the write-ahead log only where no other connection is open.
+            database.execute("PRAGMA journal_mode = DELETE")
+        except sqlite3.OperationalError:
+            raise StartError(
+                f"{folder} is being served: stop `veilface serve` there, or choose another folder"
+            ) from None
+        except sqlite3.DatabaseError:
+            pass  # no database any more
+
+
 def _prepare_folder(folder: Path) -> None:
     settings = folder / "veilface.toml"
     if folder.exists() and any(folder.iterdir()):
         if not (settings.is_file() and settings.read_text(encoding="utf-8").startswith(MARKER)):
             raise StartError(f"{folder} is not empty and not a demo; choose another folder")
+        _require_unserved(folder)
         shutil.rmtree(folder)
     folder.mkdir(parents=True, exist_ok=True)
     # Written first, so that a demo that is interrupted can be replaced.

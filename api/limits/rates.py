@@ -33,6 +33,10 @@ RETRY_STORAGE_S = 5.0
 
 CONNECTIONS = 16
 
+CROWD = 10_000
+"""Counters in this process from which on larger networks count as one client. The library looks
+through all counters at a request: 10,000 take a millisecond."""
+
 
 class RateLimits:
     """The limits in force, of one worker.
@@ -56,7 +60,8 @@ class RateLimits:
             for kind, text in (("key", key), ("address", address))
             if text != OFF
         }
-        self._own = SlidingWindowCounterRateLimiter(MemoryStorage())
+        self._own_counters = MemoryStorage()
+        self._own = SlidingWindowCounterRateLimiter(self._own_counters)
         self._redis = None if redis_url is None else _opened(redis_url, prefix)
         self._shared = self._own
         if self._redis is not None:
@@ -77,7 +82,8 @@ class RateLimits:
     async def count_address(self, scope: Scope) -> None:
         """Count a request by its client's address, before anything else is known of it."""
         client = scope.get("client")
-        await self._count("address", address_of(client[0] if client else ""))
+        crowded = len(self._own_counters.storage) >= CROWD
+        await self._count("address", address_of(client[0] if client else "", crowded=crowded))
 
     async def count_key(self, prefix: str) -> None:
         """Count a request by its API key, or the one that made its token."""
@@ -163,18 +169,20 @@ async def _hit(
     return window.reset_time - time.time()
 
 
-def address_of(host: str) -> str:
+def address_of(host: str, *, crowded: bool = False) -> str:
     """Name what is counted as one client: an IPv4 address, or the /64 network of an IPv6 address.
 
     A provider gives each customer a /64 at least: an attacker would not run out of addresses in
-    it. What is no address, as a proxy may pass it on, is one client, ``unknown``.
+    it. In a crowd it is a /24 and a /48, of which one customer may have every /64. What is no
+    address, as a proxy may pass it on, is one client, ``unknown``.
     """
     try:
         address = ipaddress.ip_address(host)
     except ValueError:
         return "unknown"
-    if isinstance(address, ipaddress.IPv6Address):
-        if address.ipv4_mapped is None:
-            return str(ipaddress.IPv6Network((int(address), 64), strict=False))
+    if isinstance(address, ipaddress.IPv6Address) and address.ipv4_mapped is not None:
         address = address.ipv4_mapped
-    return str(address)
+    if isinstance(address, ipaddress.IPv6Address):
+        length = 48 if crowded else 64
+        return str(ipaddress.IPv6Network((int(address), length), strict=False))
+    return str(ipaddress.IPv4Network((int(address), 24), strict=False) if crowded else address)

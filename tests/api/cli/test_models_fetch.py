@@ -157,6 +157,17 @@ def assert_refused(ran: Ran, reason: str) -> None:
     assert nothing_is_left()
 
 
+@pytest.mark.parametrize("place", ["address", "file"])
+def test_a_large_file_is_refused(
+    site: Site, graph: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str
+) -> None:
+    monkeypatch.setattr("api.cli.pack_download.MAX_FILE_BYTES", len(graph) - 1)
+    site.files["/a.onnx"] = graph
+    (tmp_path / "a.onnx").write_bytes(graph)
+    source = f"{site.url}/a.onnx" if place == "address" else str(tmp_path / "a.onnx")
+    assert_refused(fetch("mine", "--from", source), "is larger than")
+
+
 def test_without_a_network_a_file_does_as_well(site: Site, graph: bytes, tmp_path: Path) -> None:
     refused = fetch("mine", "--from", f"http://127.0.0.1:{free_port()}/rec.onnx")
     assert refused.status == 1

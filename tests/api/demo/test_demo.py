@@ -1,6 +1,8 @@
 """The demo, at a small scale, through its real process and HTTP."""
 
+import contextlib
 import json
+import sqlite3
 import stat
 
 import pytest
@@ -83,6 +85,21 @@ def test_it_replaces_its_own_folder_and_no_other(played, tmp_path):
     ran = run("demo", "--folder", tmp_path)
     assert ran.status == 1
     assert ran.stdout == ""
+
+
+def test_a_folder_that_is_being_served_is_not_replaced(tmp_path, monkeypatch):
+    folder = tmp_path / "demo"
+    monkeypatch.setattr("api.demo.run.build_demo_pack", lambda _: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        run_demo(folder, scale=SMALL)
+    with contextlib.closing(sqlite3.connect(folder / "veilface.db")) as served:
+        served.execute("PRAGMA journal_mode = WAL")
+        served.execute("CREATE TABLE subjects (id)")
+        with pytest.raises(StartError, match="is being served"):
+            run_demo(folder, scale=SMALL)
+    with pytest.raises(ZeroDivisionError):
+        run_demo(folder, scale=SMALL)
+    assert not (folder / "veilface.db").exists()
 
 
 def test_a_pack_without_faces_is_refused(tmp_path):

@@ -83,18 +83,35 @@ async def refusal(count: Awaitable[None]) -> ApiError | None:
 
 
 @pytest.mark.parametrize(
-    ("host", "counted"),
+    ("host", "crowded", "counted"),
     [
-        ("192.0.2.7", "192.0.2.7"),
-        ("2001:db8:1:2:3:4:5:6", "2001:db8:1:2::/64"),
-        ("fe80::1%eth0", "fe80::/64"),
-        ("::ffff:192.0.2.7", "192.0.2.7"),
-        ("", "unknown"),
-        ("192.0.2.7, 10.0.0.1", "unknown"),
+        ("192.0.2.7", False, "192.0.2.7"),
+        ("2001:db8:1:2:3:4:5:6", False, "2001:db8:1:2::/64"),
+        ("fe80::1%eth0", False, "fe80::/64"),
+        ("::ffff:192.0.2.7", False, "192.0.2.7"),
+        ("", False, "unknown"),
+        ("192.0.2.7, 10.0.0.1", False, "unknown"),
+        ("2001:db8:1:2::", True, "2001:db8:1::/48"),
+        ("::ffff:192.0.2.7", True, "192.0.2.0/24"),
+        ("", True, "unknown"),
     ],
 )
-def test_an_address_is_counted_by_what_one_client_has(host: str, counted: str) -> None:
-    assert address_of(host) == counted
+def test_an_address_is_counted_by_what_one_client_has(
+    host: str, crowded: bool, counted: str
+) -> None:
+    assert address_of(host, crowded=crowded) == counted
+
+
+def test_one_customer_with_many_networks_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rates, "CROWD", 100)
+
+    async def knock() -> None:
+        limits = RateLimits(key="off", address="50/minute")
+        for network in range(300):
+            await limits.count_address({"client": (f"2001:db8:1:{network:x}::", 1)})
+
+    with pytest.raises(ApiError, match="too many requests from this address"):
+        anyio.run(knock)
 
 
 def test_the_next_one_is_refused_and_told_how_long_to_wait(make: Make) -> None:
