@@ -1,7 +1,7 @@
 """``veilface audit-log``: who did what, and whether the log is whole."""
 
 import json
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -175,7 +175,12 @@ def show(
             for line in store.audit_log.lines(after=after)
             if name in (None, line.tenant) and pseudonym in (None, line.pseudonym)
         )
-        say_lines(json.dumps(_described(line)) for line in islice(chosen, limit))
+        first = next(chosen, None)
+        if first is None and name is not None:
+            store.tenants.get(name)  # one that does not exist has no empty log
+        elif first is not None:
+            told = islice(chain([first], chosen), limit)
+            say_lines(json.dumps(_described(line)) for line in told)
 
 
 def _described(line: Line) -> dict[str, Any]:

@@ -60,8 +60,9 @@ def check(*, settings: Settings) -> Result:
     Example: `veilface db check --data-dir veilface-data`
     """
     store = open_store(settings, open_keyring(settings))
-    facts = {"current": _revision(settings), "needed": head_revision()}
+    facts = {"current": None, "needed": head_revision()}
     try:
+        facts["current"] = _revision(settings)
         store.check()
     except VeilfaceError as error:
         return Result({"ok": False, "reason": str(error), **facts}, error=str(error))

@@ -72,6 +72,12 @@ def test_lines_are_found_by_subject_and_number(log):
     assert lines(log("audit-log", "show", "--after", "1", "--limit", "1")) == everything[1:2]
 
 
+def test_an_unknown_tenant_has_no_empty_log(log):
+    ran = log("audit-log", "show", "--tenant", "elsewhere")
+    assert (ran.status, ran.stdout) == (1, "")
+    assert "no tenant" in ran.stderr
+
+
 @pytest.mark.parametrize(
     ("statement", "problem", "record"),
     [
