@@ -26,7 +26,6 @@ def verify_presentations(
     source: DecoySource,
     *,
     level: str | None = None,
-    seed: int = 0,
 ) -> VerifiedSet:
     """Enroll each subject by three live photos, and verify all other photos of theirs, one by one.
 
@@ -47,7 +46,7 @@ def verify_presentations(
     contract.binding.require_embedder(
         embedder_sha256=info.embedder_sha256, preprocessing=info.preprocessing, n=info.n
     )
-    stream = Keystream.seeded("impostor presentations", seed)
+    stream = Keystream.seeded("impostor presentations", 0)
     rotation = TenantRotation(stream.token(KEY_BYTES), source.k)
     lift_secret = stream.token(KEY_BYTES)
     enroller = Enroller(contract, source, rotation=rotation, lift_secret=lift_secret)

@@ -192,7 +192,7 @@ def _verified(
         return None, "it takes the contract's decoys (--decoys)"
     source = load_decoys(file, file_sealer(open_keyring(settings)), pack)
     source = source.reduced(contract.binding.axes)
-    verified = verify_presentations(scored, pack.info, contract, source, level=level, seed=0)
+    verified = verify_presentations(scored, pack.info, contract, source, level=level)
     if not verified.enrolled:
         return None, (
             f"no subject has {verified.enrolled_photos} live photos that agree, to be enrolled by"

@@ -10,11 +10,6 @@ PATTERN = "^[A-Za-z0-9_-]{42}[AEIMQUYcgkosw048]=?$"
 _KEY = re.compile(PATTERN)
 
 
-def encode_holder_key(key: bytes | bytearray) -> str:
-    """Return the text of a key, without padding."""
-    return base64.urlsafe_b64encode(key).decode("ascii").rstrip("=")
-
-
 def decode_holder_key(text: object) -> bytearray:
     """Return the key of a text, to be wiped after its use; an error does not repeat the text."""
     if not isinstance(text, str) or not _KEY.fullmatch(text):

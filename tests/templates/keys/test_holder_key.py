@@ -4,14 +4,13 @@ import os
 import pytest
 
 from templates.errors import SealError
-from templates.keys.holder_key import decode_holder_key, encode_holder_key, wipe
+from templates.keys.holder_key import decode_holder_key, wipe
 
 
 def test_a_key_has_one_text_and_is_read_with_padding_or_without() -> None:
     for _ in range(50):
         key = os.urandom(32)
         text = base64.urlsafe_b64encode(key).decode()
-        assert encode_holder_key(key) == text.rstrip("=")
         assert decode_holder_key(text) == decode_holder_key(text.rstrip("=")) == key
     with pytest.raises(SealError):
         decode_holder_key(text[:-2] + "B")  # other bits where a key has none
