@@ -199,7 +199,8 @@ class Settings(BaseSettings):
         ge=0,
         le=50,
         description="Rejected verifications of one subject in a row after which it is locked for "
-        "30 seconds, and twice as long with each further one (docs/rest.md); 0: never.",
+        "30 seconds, and twice as long with each further one, an hour at most; after 50 until an "
+        "operator lifts it (docs/rest.md). 0: never.",
     )
     retention_days: int | None = Field(
         None,

@@ -60,6 +60,7 @@ class Limit:
 
 
 FOOT_POINT = "foot-point-success"
+ATTRIBUTE_LEAKAGE = "attribute-leakage"
 WITH_KEY, WITHOUT_KEY = "success-with-key", "success-without-key"
 LIMITS: tuple[Limit, ...] = (
     Limit(
@@ -83,7 +84,7 @@ LIMITS: tuple[Limit, ...] = (
         "share of renewed templates that what was stolen before opens",
     ),
     Limit(
-        "attribute-leakage",
+        ATTRIBUTE_LEAKAGE,
         0.25,
         "distance of the strongest attacker's accuracy from chance, in either direction, as a "
         "share of what raw embeddings gain over the largest class",
@@ -109,7 +110,7 @@ _BY_PROPERTY = {
     Property.IRREVERSIBILITY: "recovery-success",
     Property.UNLINKABILITY: "linkability",
     Property.RENEWABILITY: "renewed-success",
-    Property.CONFIDENTIALITY: "attribute-leakage",
+    Property.CONFIDENTIALITY: ATTRIBUTE_LEAKAGE,
     Property.IMPERSONATION: "false-acceptance",
 }
 _OF_A_TEMPLATE = (Property.IRREVERSIBILITY, Property.CONFIDENTIALITY)

@@ -5,11 +5,20 @@ from typing import Annotated
 
 import typer
 
-from api.cli.audit_report import Limits, Out, Seed, limits_of, model_json, reported, served_scheme
+from api.cli.audit_report import (
+    FAIRFACE_LIMITS,
+    Limits,
+    Out,
+    Seed,
+    limits_of,
+    model_json,
+    reported,
+    served_scheme,
+)
 from api.cli.console import share_done
 from api.cli.descriptors import BULK, Aligned, Cache, Flip, bulk_pack, extract
 from api.cli.errors import UsageError, require_extra
-from api.cli.inputs import fairface_labels, listed_dims, listed_names, load_decoys
+from api.cli.inputs import fairface_labels, listed, listed_dims, load_decoys
 from api.cli.options import DEFAULT_DIM, PROCESSOR, Device, chosen_device, quick
 from api.cli.results import Plan, Result, reports
 from api.service.opening import file_sealer, open_keyring
@@ -117,17 +126,22 @@ def fairface(
     """Infer gender, race and age from templates: the paper's experiment, and stronger attackers.
 
     Writes report.json, report.md and figures, the paper's among them, to --out. "The contract" is
-    that in `data_dir` where it is of these decoys. Exit
-    status 1: the strongest attacker exceeds the limit; 3: none does, and too few faces show it.
+    that in `data_dir` where it is of these decoys. Exit status 1: the strongest attacker exceeds
+    the limit; 3: none does, and too few faces show it.
     docs/privacy.md explains every figure.
 
     Example: `veilface audit fairface fairface --pack buffalo_l --out audit`
     """
     require_extra("audit")
-    limits = limits_of(limit)
+    limits = limits_of(limit, FAIRFACE_LIMITS)
     torch_device = chosen_device(device)
     pack = bulk_pack(settings, flip=flip, why="an audit attacks embeddings of a model pack")
-    strategies = listed_names(strategy, STRATEGIES, "--strategy")
+    places = listed(
+        strategy,
+        STRATEGIES.index,
+        "--strategy",
+        expected=f"a list of {', '.join(STRATEGIES)}",
+    )
     generator, served = _deployed(decoys, settings, pack)
     if served is not None:
         axes, service_dim = axes or served.axes, service_dim or served.m
@@ -139,7 +153,7 @@ def fairface(
     if service_dim >= n:
         raise UsageError(f"--service-dim must be below the {n} numbers of what is lifted")
     schemes = schemes_of(
-        strategies=[name for name in STRATEGIES if name in strategies and name != RAW],
+        strategies=[STRATEGIES[one] for one in sorted({*places}) if STRATEGIES[one] != RAW],
         dims=listed_dims(dim, "--dim", n=pack.info.n, example="2,4"),
         generated_dims=tuple(dict.fromkeys((*ours, service_dim))),
         axes=axes,

@@ -13,7 +13,7 @@ from api.cli.results import Result, Table
 from api.settings import Settings
 from attacks.report import RESULTS, Document
 from attacks.report_tables import VERDICT, markdown, verdict_tables
-from attacks.verdict import LIMITS
+from attacks.verdict import ATTRIBUTE_LEAKAGE, LIMITS
 from models.pack import ModelPack
 from templates.contract.document import Binding, Contract
 from templates.decoys import DecoySource
@@ -30,23 +30,28 @@ Limits = Annotated[
         metavar="NAME=SHARE",
         help="Most that passes; may be repeated. Unset: "
         + ", ".join(f"`{limit.name}={limit.default:g}`" for limit in LIMITS)
-        + ". The report says what each limits; 1 limits nothing.",
+        + f". `audit fairface` takes `{ATTRIBUTE_LEAKAGE}`, `audit templates` the others. "
+        "The report says what each limits; 1 limits nothing.",
     ),
 ]
+
+FAIRFACE_LIMITS = (ATTRIBUTE_LEAKAGE,)
+TEMPLATE_LIMITS = tuple(limit.name for limit in LIMITS if limit.name != ATTRIBUTE_LEAKAGE)
+"""What each command judges."""
 
 NOT_SHOWN = 3
 """Exit status where nothing fails, and not everything is shown to hold."""
 
 
-def limits_of(given: Sequence[str] | None) -> dict[str, float]:
-    """Read ``NAME=SHARE`` texts: the limits by name, the defaults where none is given.
+def limits_of(given: Sequence[str] | None, names: Sequence[str]) -> dict[str, float]:
+    """Read ``NAME=SHARE`` texts: the limits of the names, the defaults where none is given.
 
     Raises
     ------
     UsageError
         No such limit, or no share from 0 to 1.
     """
-    limits = {limit.name: limit.default for limit in LIMITS}
+    limits = {limit.name: limit.default for limit in LIMITS if limit.name in names}
     for text in given or ():
         name, _, share = text.partition("=")
         try:

@@ -5,7 +5,16 @@ from typing import Annotated
 
 import typer
 
-from api.cli.audit_report import Limits, Out, Seed, limits_of, model_json, reported, served_scheme
+from api.cli.audit_report import (
+    TEMPLATE_LIMITS,
+    Limits,
+    Out,
+    Seed,
+    limits_of,
+    model_json,
+    reported,
+    served_scheme,
+)
 from api.cli.console import message, share_done
 from api.cli.descriptors import BULK, Aligned, Cache, Flip, bulk_pack, extract
 from api.cli.errors import UsageError, require_extra
@@ -103,7 +112,7 @@ def templates(
     Example: `veilface audit templates lfw --pack buffalo_l --decoys decoys.veil --out audit`
     """
     require_extra("audit")
-    limits = limits_of(limit)
+    limits = limits_of(limit, TEMPLATE_LIMITS)
     torch_device = chosen_device(device)
     pack = bulk_pack(settings, flip=flip, why="an audit attacks embeddings of a model pack")
     sealer = file_sealer(open_keyring(settings))
@@ -116,7 +125,7 @@ def templates(
     if loaded is not None:
         own = source.reduced(loaded.binding.axes)
         loaded.binding.require_source(source_id=own.source_id, made_with=own.made_with)
-    elif (served := served_scheme(settings, sealer, source)) is not None:
+    elif None in (dim, strategy, axes) and (served := served_scheme(settings, sealer, source)):
         dim, strategy = dim or str(served.m), strategy or served.strategy
         axes = axes or served.axes
         path = settings.resolved_contract_file

@@ -1,7 +1,7 @@
 """Lists, files and decoys that bulk commands are given."""
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
@@ -37,17 +37,6 @@ def listed(text: str, kind: Callable[[str], T], option: str, *, expected: str) -
     if not values:
         raise UsageError(f"{option} takes {expected}, and is empty")
     return values
-
-
-def listed_names(text: str, names: Sequence[str], option: str) -> tuple[str, ...]:
-    """Read a list of some of the names."""
-
-    def known(name: str) -> str:
-        if name not in names:
-            raise ValueError(name)
-        return name
-
-    return listed(text, known, option, expected=f"of {', '.join(names)}")
 
 
 def fairface_labels(root: Path, part: str) -> dict[Path, Label]:

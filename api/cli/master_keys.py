@@ -130,7 +130,10 @@ def renew(
         text += [f"    {subject}" for subject in subjects]
         text.append(f"  Then run `veilface keys rotate-tenant --tenant {name} --stolen --finish`.")
     if api_keys:
-        text.append("- Make others (`veilface keys create`) in place of these API keys:")
+        text.append(
+            "- Make a new key for each of these (`veilface keys create`), hand it over, then "
+            "revoke the old one:"
+        )
     text += [f"    veilface keys revoke {prefix}" for prefix in api_keys]
     if settings.export_key_file is not None:
         text.append("- Make another export key file, if it was stolen too.")

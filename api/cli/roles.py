@@ -152,7 +152,8 @@ def is_telling(albums: Albums) -> bool:
     """Whether so many people can show that templates are private.
 
     Axes and dimension are chosen on one half of those attacked, and judged on the other, with the
-    faces of all others. Who is attacked is drawn: their photos are counted as is to be expected.
+    faces of all others. The people attacked are drawn at random, so the expected number of their
+    photos is used.
     """
     several, total = _with_several(albums), sum(map(len, albums.values()))
     attacked = min(MOST_ATTACKED, len(albums) // 2)

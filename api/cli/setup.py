@@ -291,12 +291,13 @@ def kept_api_key(settings: Settings, keyring: MasterKeyring) -> Path:
     """Return the private file with a key that the store takes; make one where there is none."""
     file = api_key_file(settings)
     with opened_store(settings, keyring) as store:
-        token = read_bounded(file, 4096).decode("ascii", "replace").strip() if file.exists() else ""
+        is_there = file.exists()
+        token = read_bounded(file, 4096).decode("ascii", "replace").strip() if is_there else ""
         if store.api_keys.verify(token) is not None:
             message(f"... API key: {file} is there and kept")
             return file
         why = f"the store does not take the one of {file}: making another"
-        message(f"... API key: {why if token else f'making {file}'}")
+        message(f"... API key: {why if is_there else f'making {file}'}")
         store.tenants.create(DEFAULT_TENANT)
         new = store.api_keys.create(DEFAULT_TENANT, RIGHTS, label="setup", by=operator())
         replace_private(file, f"{new.token}\n".encode())

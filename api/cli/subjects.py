@@ -67,9 +67,9 @@ def enroll(
     """Enroll a person from photos, or replace their enrollment; or enroll many with --from.
 
     Needs: what `serve` needs (contract, decoys, pack); the service may run meanwhile. Three photos
-    are better than one. Only the private template is stored. A hybrid+ contract takes attributes of
-    a person, which REST alone does. With --from, exit status 1 means that
-    somebody was not enrolled; the others are.
+    are better than one. Only the private template is stored. Under a hybrid+ contract enroll over
+    REST, which takes the attributes. With --from, exit status 1 means that somebody was not
+    enrolled; the others are.
 
     Example: `veilface enroll alice alice-1.jpg alice-2.jpg alice-3.jpg --pack buffalo_l`
     """
@@ -214,8 +214,8 @@ def verify(
     Several photos are averaged, which rejects the right person less often. Exit status 3 means that
     no decision was made, and stderr says why. Needs: what `serve` needs; the service may run
     meanwhile. The decision goes into the audit log; it neither counts towards the subject's lockout
-    nor is stopped by it. An enrollment with a holder's key, which REST alone takes, rejects
-    everybody.
+    nor is stopped by it. It cannot take a holder's key, so it rejects everybody whose enrollment
+    has one.
 
     Example: `veilface verify alice now-1.jpg now-2.jpg now-3.jpg --pack buffalo_l --level fmr-1e-4`
     """

@@ -120,7 +120,10 @@ def _require_type(request: Request, media_type: str, how: str) -> None:
 
 
 async def read_form(request: Request, model: type[B], *, photos: str, most: int) -> B:
-    """Read a multipart body; `photos` is the field that they are sent in, `most` how many."""
+    """Read a multipart body.
+
+    `photos` names the field for photos, of which at most `most` may come.
+    """
     _require_type(request, _FORM, how_to_send(photos))
     with _arrives_within(BODY_TIMEOUT_S):
         try:

@@ -242,13 +242,33 @@ class SignedReceipt(_Shape):
     signature: str = Field(description="Ed25519 over the UTF-8 bytes of `body`, base64.")
 
 
+class ErasedItem(_Shape):
+    """Records of one kind that the erasure removed."""
+
+    item: Literal["template", "data_key", "metadata", "failed_attempts"]
+    count: int
+
+
+class ReceiptClaims(_Shape):
+    """What `body` says, for reading only: it is not signed in this form."""
+
+    kind: Literal["veilface-erasure-receipt"]
+    version: Literal[1]
+    receipt_id: str = Field(description="Random; no two receipts share one.")
+    tenant: str
+    subject: str = Field(description="Pseudonym: HMAC of the subject id under a secret key.")
+    erased_at: str = Field(examples=["2026-01-31T12:00:00.000000+00:00"])
+    held: bool = Field(description="False: nobody was enrolled.")
+    contract_id: str | None = Field(description="Of the template; null: none was held.")
+    erased: list[ErasedItem] = Field(description="Every kind of record, with what was removed.")
+    signing_key: str = Field(description="`receipt_key.key_id` of GET /v1/contract.")
+
+
 class ReceiptAnswer(_Answer):
     """The receipt of an erasure."""
 
     receipt: SignedReceipt
-    claims: dict[str, Any] = Field(
-        description="What `body` says, for reading only: it is not signed in this form."
-    )
+    claims: ReceiptClaims
     log_purged: bool = Field(
         description="False where a reader of SQLite's database keeps old pages in the write-ahead "
         "log just now: they go with a later purge."

@@ -82,7 +82,8 @@ def log(event: str, *, severity: int = logging.INFO, **fields: Any) -> None:
 def configure(level: str) -> None:
     """Send our lines and uvicorn's to stderr from now on; again, it only changes the level.
 
-    Of what uvicorn tells at the level `info`, each start and stop, our own lines say more.
+    At `info` uvicorn logs starts and stops, of which our own lines say more: so it is set to
+    `warning`.
     """
     for name, least in ((LOGGER, level), (UVICORN, "warning" if level == "info" else level)):
         logger = logging.getLogger(name)

@@ -55,7 +55,8 @@ async def enroll(
             sent = await read_form(request, EnrollmentForm, photos="images", most=MAX_PHOTOS)
         else:
             sent = await read_json(request, EnrollmentJson, photos="images")
-            # After the fields: who only forgot how to send a photo needs no further right.
+            # After the fields: a caller who only sent the photo wrongly is told so first, not
+            # that a right is missing.
             call.require("embeddings")
             await call.query(lambda: runtime.require_template_enrollment(tenant))
 

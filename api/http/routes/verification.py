@@ -127,7 +127,8 @@ async def _sent(call: Call) -> VerifyForm | VerifyJson:
     request, runtime = call.request, call.runtime
     if not is_form(request):
         sent = await read_json(request, VerifyJson, photos="image")
-        # After the fields: who only forgot how to send a photo needs no further right.
+        # After the fields: a caller who only sent the photo wrongly is told so first, not that a
+        # right is missing.
         call.require("embeddings")
         runtime.liveness.require(photos=False, challenge=False)
         return sent

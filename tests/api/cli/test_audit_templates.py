@@ -14,7 +14,7 @@ import pytest
 
 import attacks.audit
 from api.cli import audit_templates
-from api.cli.audit_report import served_scheme
+from api.cli.audit_report import TEMPLATE_LIMITS, served_scheme
 from api.service.opening import file_sealer, open_keyring
 from api.settings import Settings
 from attacks.audit import AuditPlan, AuditResult
@@ -35,7 +35,7 @@ from tests.attacks.beds import bed_of
 from tests.leaks import LeakSearch
 from verify import calibrate
 
-WITHOUT_LIMITS = [f"--limit={limit.name}=1" for limit in LIMITS]
+WITHOUT_LIMITS = [f"--limit={name}=1" for name in TEMPLATE_LIMITS]
 
 
 @dataclass(frozen=True)
@@ -186,6 +186,7 @@ def test_what_two_attacks_found_becomes_report_verdict_and_status(
         (["--dim", "3"], ((3,), "hybrid"), "auditing hybrid templates of m = 3"),
         (["--strategy", "random"], ((DIM,), "random"), f"auditing random templates of m = {DIM}"),
         ([], ((DIM,), "hybrid"), f"auditing hybrid templates of m = {DIM}"),
+        (["--dim", "3", "--strategy", "random", "--axes", "50"], ((3,), "random"), None),
     ],
 )
 def test_what_is_not_set_is_the_contracts(

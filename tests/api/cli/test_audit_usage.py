@@ -19,7 +19,11 @@ FAIRFACE_USAGE: list[tuple[list[str], str]] = [
     (["--limit", "attribute-leakage=1.5"], "not 'attribute-leakage=1.5'"),
     (["--limit", "attribute-leakage"], "--limit takes NAME=SHARE, a share from 0 to 1 and a name"),
     (["--limit", "leakage=0.1"], "not 'leakage=0.1'"),
-    (["--strategy", "raw,homomorphic"], "--strategy takes of raw, random, adversarial, hybrid"),
+    (["--limit", "linkability=0"], "a name of attribute-leakage, not 'linkability=0'"),
+    (
+        ["--strategy", "raw,homomorphic"],
+        "--strategy takes a list of raw, random, adversarial, hybrid",
+    ),
     (["--dim", "two"], "--dim takes whole numbers such as 2,4, not 'two'"),
     (["--dim", "2,256"], "--dim takes dimensions from 1 to 255, not 256"),
     (["--dim", "0"], "--dim takes dimensions from 1 to 255, not 0"),
@@ -28,6 +32,7 @@ FAIRFACE_USAGE: list[tuple[list[str], str]] = [
     (["--service-dim", "50"], "--service-dim must be below the 50 numbers of what is lifted"),
 ]
 TEMPLATES_USAGE: list[tuple[list[str], str]] = [
+    (["--limit", "attribute-leakage=0"], "not 'attribute-leakage=0'"),
     (["--device", "nowhere"], "; leave out --device to use the processor"),
     (["--dim", "many"], "--dim takes whole numbers such as 16,32, not 'many'"),
     (["--dim", "16,256", *AXES], "--dim takes dimensions from 1 to 49, not 256"),

@@ -185,7 +185,7 @@ def test_an_api_key_that_the_store_does_not_take_is_replaced(
     tokens = [file.read_text()]
     prefix = tokens[0].split("_")[1]
     assert run("keys", "revoke", prefix).status == 0
-    for text in (tokens[0], "hello\n"):
+    for text in (tokens[0], "hello\n", ""):
         file.write_text(text)
         ran = prepared()
         assert ran.status == 0, ran.stderr
@@ -194,7 +194,7 @@ def test_an_api_key_that_the_store_does_not_take_is_replaced(
         tokens.append(file.read_text())
         assert f"API key: {file} is there and kept" in prepared().stderr
         assert file.read_text() == tokens[-1]
-    assert len(set(tokens)) == 3
+    assert len(set(tokens)) == 4
 
 
 def test_a_master_key_that_is_given_is_not_made(
