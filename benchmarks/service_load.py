@@ -43,7 +43,7 @@ def measure(args: argparse.Namespace) -> list[dict[str, object]]:
     """Return a row for each kind and number of clients."""
     rows = []
     with deployment.running(
-        args, workers=args.workers, lockout_after="5", queue_limit="96"
+        args, workers=args.workers, lockout_after="5", queue_limit="160"
     ) as service:
         pack = ModelPack.load(args.pack, threads=1)
         people = clear_people(args, pack, args.people)
