@@ -23,7 +23,8 @@ def subject(demo: Served) -> Iterator[str]:
     """Erase whom a test enrolled, and the lock that its rejections may have left."""
     yield SUBJECT
     with demo.client() as client:
-        assert client.delete(f"/v1/subjects/{SUBJECT}").is_success
+        # A test may enroll nobody, and be the first one here.
+        assert client.delete(f"/v1/subjects/{SUBJECT}").status_code in (200, 404)
 
 
 @dataclass
