@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import timedelta
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from sqlalchemy import inspect, select
@@ -59,20 +59,23 @@ class Deployment:
     source: DecoyPool | DecoyGenerator
 
     @classmethod
-    def open(
-        cls,
-        settings: Settings,
-        *,
-        keyring: MasterKeyring | None = None,
-        contract: Contract | None = None,
-    ) -> Self:
-        """Open what the settings name; ``keyring`` and ``contract`` are open already, if given."""
-        keyring = keyring or open_keyring(settings)
+    def open(cls, settings: Settings, *, contract: Contract | None = None) -> Self:
+        """Open what the settings name; ``contract`` is open already, if it is given.
+
+        The database comes last: it is not migrated for a service that does not start.
+        """
+        keyring = open_keyring(settings)
         contract = contract or open_contract(settings, keyring)
+        more = cls._more(settings, contract)
         source = open_decoys(settings, keyring, contract)
         store = open_store(settings, keyring)
         prepare_database(store)
-        return cls(settings, keyring, store, contract, source)
+        return cls(settings, keyring, store, contract, source, **more)
+
+    @classmethod
+    def _more(cls, settings: Settings, contract: Contract) -> dict[str, Any]:  # noqa: ARG003
+        """Open what a subclass has beside this, by its fields."""
+        return {}
 
     def close(self) -> None:
         """Let go of the database's connections."""

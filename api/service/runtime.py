@@ -11,18 +11,13 @@
 import contextlib
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal, Self
+from typing import Any, Literal
 
 from api.http.errors import ApiError
 from api.http.policy import Levels, LivenessRules
 from api.http.transfer import Exported, ExportKey, seal_export
 from api.service.allocator import keep_few_arenas
-from api.service.opening import (
-    Deployment,
-    open_contract,
-    open_keyring,
-    open_pack,
-)
+from api.service.opening import Deployment, open_pack
 from api.service.served_graphs import served_graphs
 from api.service.stand_in import SealedStandIn
 from api.settings import Settings
@@ -34,7 +29,6 @@ from templates.contract import wire
 from templates.contract.document import Contract
 from templates.errors import StoreBusy
 from templates.keys.rotation import TenantRotation
-from templates.keys.sealing import MasterKeyring
 from templates.store.audit_log import By
 from templates.store.secrets import SecretName
 from templates.store.subject_rows import Source, SubjectTemplate
@@ -77,25 +71,13 @@ class Runtime(Deployment):
         self._of = lru_cache(TENANTS_KEPT)(self._in_rotation)
 
     @classmethod
-    def open(
-        cls,
-        settings: Settings,
-        *,
-        keyring: MasterKeyring | None = None,
-        contract: Contract | None = None,
-    ) -> Self:
-        """Open what the settings name.
-
-        The pack comes first: no database is migrated for a service that does not start.
-        """
+    def _more(cls, settings: Settings, contract: Contract) -> dict[str, Any]:
         keep_few_arenas(settings.resolved_compute_slots)
-        keyring = keyring or open_keyring(settings)
-        contract = contract or open_contract(settings, keyring)
-        pack = open_pack(settings, contract)
         file = settings.export_key_file
-        export_key = None if file is None else ExportKey.from_file(file)
-        opened = Deployment.open(settings, keyring=keyring, contract=contract)
-        return cls(**vars(opened), pack=pack, operators_export_key=export_key)
+        return {
+            "pack": open_pack(settings, contract),
+            "operators_export_key": None if file is None else ExportKey.from_file(file),
+        }
 
     @property
     def export_key(self) -> ExportKey:
