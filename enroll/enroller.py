@@ -15,7 +15,6 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from models.decoding import DEFAULT_LIMITS, ImageLimits
 from models.pack import ModelPack
 from models.quality import DEFAULT_QUALITY, Quality, QualityLimits
 from models.selection import FacePolicy
@@ -116,7 +115,6 @@ class Enroller:
         holder: Holder | None = None,
         policy: FacePolicy = FacePolicy.DOMINANT,
         quality: QualityLimits | None = DEFAULT_QUALITY,
-        limits: ImageLimits = DEFAULT_LIMITS,
     ) -> Enrollment:
         """Enroll from 1 to 10 photo files; parameters as in `from_embeddings` and `PhotoOptions`.
 
@@ -135,9 +133,7 @@ class Enroller:
         )
         if not 1 <= len(photos) <= MAX_PHOTOS:
             raise ValueError(f"an enrollment has 1 to {MAX_PHOTOS} photos, not {len(photos)}")
-        samples = pack.embed_photos(
-            photos, policy=policy, quality=quality, limits=limits, digested=True
-        )
+        samples = pack.embed_photos(photos, policy=policy, quality=quality, digested=True)
         embeddings = np.stack([sample.embedding for sample in samples])
         return self._lifted(
             unit_rows(embeddings, n=info.n, most=MAX_PHOTOS),

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from models.alignment import TEMPLATE_NAME, align, template
 from models.boxes import Face, ranked
-from models.decoding import DEFAULT_LIMITS, ImageLimits, decode_image, picture_digest
+from models.decoding import decode_image, picture_digest
 from models.demo import DEMO_DIMENSION, is_demo_model, require_face
 from models.detection import DEFAULT_SIZE, Detector, find_faces, require_upright
 from models.detectors import Scrfd, YuNet
@@ -53,7 +53,6 @@ class PhotoOptions(TypedDict, total=False):
 
     policy: FacePolicy | None  # which of several faces is meant; None: the most central one
     quality: QualityLimits | None  # None checks nothing but that there is an upright face
-    limits: ImageLimits  # what decoding may cost
     liveness: bool  # also say how live the face looks; the pack needs a liveness graph
     digested: bool  # also give the digest of the decoded photo
 
@@ -200,7 +199,6 @@ class ModelPack:
         *,
         policy: FacePolicy | None = FacePolicy.DOMINANT,
         quality: QualityLimits | None = DEFAULT_QUALITY,
-        limits: ImageLimits = DEFAULT_LIMITS,
         liveness: bool = False,
         digested: bool = False,
     ) -> FaceCrop:
@@ -214,7 +212,7 @@ class ModelPack:
                 f"The pack {self.info.name} has no liveness graph; add one to its folder"
                 " (docs/liveness.md)."
             )
-        image = decode_image(data, limits=limits)
+        image = decode_image(data)
         face = score = None
         if self._detector is None:
             crop = self.as_aligned(image)

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from models.decoding import DEFAULT_LIMITS, ImageLimits
 from models.errors import FaceError, ModelError, PackError, PhotoRejected
 from models.faces import FaceCrop
 from models.head_pose import HeadPose, head_pose
@@ -62,7 +61,6 @@ def probe_of_photos(
     *,
     passive: bool,
     policy: FacePolicy = FacePolicy.DOMINANT,
-    limits: ImageLimits = DEFAULT_LIMITS,
 ) -> PhotoProbe:
     """Average photos of one person; with `passive`, say whether they look live on average.
 
@@ -73,7 +71,7 @@ def probe_of_photos(
     InconsistentImages
         Where the photos do not show one person.
     """
-    samples = pack.embed_photos(photos, policy=policy, limits=limits, liveness=passive)
+    samples = pack.embed_photos(photos, policy=policy, liveness=passive)
     rows = np.stack([sample.embedding for sample in samples])
     mean = mean_embedding(rows, consistency=contract.probe_consistency)
     distinct = [samples[place] for place in distinct_rows(rows)]
@@ -98,7 +96,6 @@ def probe_of_frames(
     *,
     passive: bool,
     policy: FacePolicy = FacePolicy.DOMINANT,
-    limits: ImageLimits = DEFAULT_LIMITS,
 ) -> PhotoProbe:
     """Make one probe of the frames of a challenge, and hold them against it.
 
@@ -112,7 +109,7 @@ def probe_of_frames(
         Where a frame has no usable face, or the first one is not good enough to be compared.
     """
     read = [
-        _read(pack, frame, place, len(frames), passive=passive, policy=policy, limits=limits)
+        _read(pack, frame, place, len(frames), passive=passive, policy=policy)
         for place, frame in enumerate(frames)
     ]
     poses = [pose for _, pose in read]
@@ -156,14 +153,11 @@ def _read(
     *,
     passive: bool,
     policy: FacePolicy,
-    limits: ImageLimits,
 ) -> tuple[FaceCrop, HeadPose]:
     """Read one frame, and drop its picture; the first one must be good enough to be compared."""
     quality = DEFAULT_QUALITY if place == 0 else MOVING
     try:
-        taken = pack.crop_photo(
-            data, policy=policy, quality=quality, limits=limits, liveness=passive
-        )
+        taken = pack.crop_photo(data, policy=policy, quality=quality, liveness=passive)
         if taken.face is None:
             raise PackError("A challenge needs a pack with a detector.")
         return taken, head_pose(taken.face.keypoints)

@@ -23,7 +23,6 @@ from api.service.stand_in import SealedStandIn
 from api.settings import Settings
 from enroll import Enroller, Enrollment
 from enroll.enroller import WIRE_DTYPE
-from models.decoding import DEFAULT_LIMITS
 from models.pack import ModelPack
 from templates.contract import wire
 from templates.contract.document import Contract
@@ -58,7 +57,6 @@ class Runtime(Deployment):
 
     pack: ModelPack | None
     operators_export_key: ExportKey | None
-    image_limits = DEFAULT_LIMITS
 
     def __post_init__(self) -> None:
         self.levels = Levels(self.contract, lowest=self.settings.lowest_level)

@@ -77,7 +77,6 @@ async def enroll(
                         attributes=sent.attributes,
                         holder=holder,
                         policy=sent.face,
-                        limits=runtime.image_limits,
                     )
             finally:
                 wipe(key)

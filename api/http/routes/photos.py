@@ -40,10 +40,9 @@ async def check_photo(call: EnrollsOrVerifies) -> PhotoCheckAnswer:
             sent = await read_form(call.request, PhotoCheckForm, photos="image", most=1)
 
         def work() -> PhotoCheckAnswer:
-            limits = runtime.image_limits
             try:
                 with step("check"):
-                    taken = pack.crop_photo(sent.image[0], policy=sent.face, limits=limits)
+                    taken = pack.crop_photo(sent.image[0], policy=sent.face)
             except FaceError as refusal:
                 code: Any = refusal.code
                 return PhotoCheckAnswer(
@@ -106,7 +105,7 @@ def _decide(call: Call, sent: CompareForm, level: str) -> Decision:
     with step("photo"):
         with _position(0):
             template = runtime.enroller(call.tenant, epoch).from_photos(
-                pack, [first], policy=sent.face, limits=runtime.image_limits
+                pack, [first], policy=sent.face
             )
         with _position(1):
             probe = probe_of_photos(
@@ -115,7 +114,6 @@ def _decide(call: Call, sent: CompareForm, level: str) -> Decision:
                 [second],
                 passive=passive,
                 policy=sent.face,
-                limits=runtime.image_limits,
             )
     with step("decide"):
         verifier = runtime.verifier(call.tenant, epoch)

@@ -221,7 +221,6 @@ def _probe(
             sent.photos,
             passive=runtime.liveness.policy.passive,
             policy=sent.face,
-            limits=runtime.image_limits,
         )
 
 

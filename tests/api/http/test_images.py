@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,8 @@ import pytest
 from PIL import Image
 
 from api.http.app import create_app
-from api.service.runtime import Runtime
-from models.decoding import ImageLimits
+from models import pack
+from models.decoding import ImageLimits, decode_image
 from tests.api.awkward import Case, bombs, damaged, encode, no_pictures, scenes, unusual
 from tests.api.client import Client
 from tests.api.deployment import (
@@ -54,7 +55,8 @@ def failures(client: Client, cases: list[Case]) -> list[str]:
 def smaller_photos() -> Iterator[None]:
     """Bombs of so few pixels take a second less each to make."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Runtime, "image_limits", ImageLimits(max_pixels=MAX_PIXELS))
+        limits = ImageLimits(max_pixels=MAX_PIXELS)
+        patch.setattr(pack, "decode_image", partial(decode_image, limits=limits))
         yield
 
 
