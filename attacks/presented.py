@@ -73,7 +73,7 @@ def _presented(
             leaked=leaked,
             level=level.name,
             measured=share_of(hits),
-            chance=level.fmr.value if level.target_fmr is None else level.target_fmr,
+            chance=level.stated_fmr,
             details={
                 "mode": calibration.mode,
                 "refused_by_the_input_checks": int(np.count_nonzero(~passed)),

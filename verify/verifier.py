@@ -231,7 +231,7 @@ class Verifier:
             accepted=accepted,
             reason="match" if accepted else "no_match",
             level=level.name,
-            fmr=level.fmr.value if level.target_fmr is None else level.target_fmr,
+            fmr=level.stated_fmr,
             contract_id=self._contract.contract_id,
             calibration_id=calibration.calibration_id,
             similarity=close,

@@ -230,10 +230,7 @@ def _play(
     if not enrolled:
         raise StartError("nobody could be enrolled: " + "; ".join(refused))
     say("verifying genuine and impostor photos over HTTP")
-    rates = {
-        level.name: level.fmr.value if level.target_fmr is None else level.target_fmr
-        for level in contract.calibration("p2s").levels
-    }
+    rates = {level.name: level.stated_fmr for level in contract.calibration("p2s").levels}
     default = contract.default_level
     attempts = _attempts(client, cast, enrolled, [*rates], refused)
     at_default = [attempt for attempt in attempts if attempt.level == default]

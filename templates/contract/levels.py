@@ -143,6 +143,11 @@ class Level(JsonValue):
     frr_by_photos: Mapping[Photos, Rate] = field(default_factory=dict)
     groups: Annotated[tuple[GroupRates, ...], Field(max_length=MAX_GROUPS)] = ()
 
+    @property
+    def stated_fmr(self) -> float:
+        """What a stranger reaches: the target, or without one the rate that was seen."""
+        return self.fmr.value if self.target_fmr is None else self.target_fmr
+
     def to_json(self) -> dict[str, Json]:
         """JSON form; without ``frr_by_photos`` and ``groups`` where they are empty."""
         value = super().to_json()
