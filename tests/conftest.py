@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, settings
 
+from tests.required import absent
 from tests.seeded import drawn_of
 
 # A busy machine is no failure: no example has a deadline, and none is too slow to be drawn. Every
@@ -76,9 +77,7 @@ def shared_data() -> Path:
     root = Path(os.environ.get("VEILFACE_TEST_DATA", DEFAULT_SHARED_DATA))
     if not (root / "README.md").exists():
         reason = f"real models and faces are absent: {root} does not exist"
-        if os.environ.get("VEILFACE_REQUIRE_DATA") == "1":
-            pytest.fail(reason)
-        pytest.skip(reason)
+        absent(reason, "VEILFACE_REQUIRE_DATA")
     return root
 
 

@@ -25,6 +25,7 @@ from sqlalchemy.engine import make_url
 
 from templates.store import migrate
 from templates.store.database import Database
+from tests.required import absent
 
 DEFAULT_SERVER = "postgresql://postgres@127.0.0.1:5432/postgres"
 
@@ -46,9 +47,7 @@ def empty_database(options: str = "") -> Iterator[str]:
         connection = psycopg.connect(server, autocommit=True, connect_timeout=3)
     except psycopg.OperationalError as error:
         reason = f"no PostgreSQL server answers ({type(error).__name__})"
-        if os.environ.get("VEILFACE_REQUIRE_POSTGRES") == "1":
-            pytest.fail(f"{reason}, and VEILFACE_REQUIRE_POSTGRES=1 asks for one")
-        pytest.skip(reason)
+        absent(reason, "VEILFACE_REQUIRE_POSTGRES")
     name = f"veilface_test_{secrets.token_hex(6)}"
     with connection:
         connection.execute(f'CREATE DATABASE "{name}" {options}')

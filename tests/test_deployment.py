@@ -1,6 +1,5 @@
 """The files in deploy/: what they set exists, nothing secret gets in; what can be run is run."""
 
-import os
 import re
 import shutil
 import subprocess
@@ -11,6 +10,7 @@ import pytest
 import yaml
 
 from api.settings import ENV_PREFIX, Settings
+from tests.required import absent
 
 ROOT = Path(__file__).resolve().parent.parent
 DEPLOY = ROOT / "deploy"
@@ -86,9 +86,7 @@ def test_the_image_gets_the_code_and_its_locked_dependencies_only() -> None:
 def systemd() -> None:
     """Skip without systemd, or fail where ``VEILFACE_REQUIRE_SYSTEMD=1`` asks for it."""
     if shutil.which("systemd-analyze") is None:
-        if os.environ.get("VEILFACE_REQUIRE_SYSTEMD") == "1":
-            pytest.fail("systemd is not installed, and VEILFACE_REQUIRE_SYSTEMD=1 asks for it")
-        pytest.skip("systemd is not installed")
+        absent("systemd is not installed", "VEILFACE_REQUIRE_SYSTEMD")
 
 
 @pytest.mark.usefixtures("systemd")

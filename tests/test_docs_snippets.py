@@ -5,7 +5,6 @@ clients and the examples in tests of their own.
 """
 
 import json
-import os
 import re
 import shlex
 import shutil
@@ -28,6 +27,7 @@ from models.pack_file import read_pack_file
 from tests.certificates import self_signed
 from tests.pages import FENCED, ROOT, Snippet, pages, snippets
 from tests.ports import free_port
+from tests.required import absent
 from verify.evaluation.embeddings_file import read_embeddings
 
 PUNCTUATION = set("();<>|&")
@@ -156,9 +156,7 @@ def test_toml_is_read(snippet: Snippet, tmp_path: Path, monkeypatch: pytest.Monk
 @of_kind("nginx")
 def test_nginx_accepts_it(snippet: Snippet, tmp_path: Path) -> None:
     if shutil.which("nginx") is None:
-        if os.environ.get("VEILFACE_REQUIRE_NGINX") == "1":
-            pytest.fail("nginx is not installed, and VEILFACE_REQUIRE_NGINX=1 asks for it")
-        pytest.skip("nginx is not installed")
+        absent("nginx is not installed", "VEILFACE_REQUIRE_NGINX")
     certificate, _ = self_signed(tmp_path, host=x509.DNSName("faces.example.org"))
     certificate.rename(tmp_path / "chain.pem")
     block = snippet.code.replace("/etc/ssl/faces/", f"{tmp_path}/")

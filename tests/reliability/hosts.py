@@ -17,11 +17,12 @@ from typing import Any
 from tests.api.deployment import Deployment, deploy
 from tests.api.server_process import ROOT, Server
 from tests.ports import free_port
-from tests.privileges import not_permitted
 from tests.redis_server import own_redis_server
 from tests.reliability.cluster import Cluster
 from tests.reliability.kill import QUIET
+from tests.required import absent
 
+ROOT_REQUIRED = "VEILFACE_REQUIRE_ROOT"
 BRIDGE = "bridge"
 PREFIX = "198.18.0"
 """Of its addresses: for measurements between networks (RFC 2544)."""
@@ -39,7 +40,7 @@ class Network:
 
     def __init__(self, hosts: int) -> None:
         if os.geteuid() != 0 or shutil.which("ip") is None:
-            not_permitted("network namespaces need root, and the program ip")
+            absent("network namespaces need root, and the program ip", ROOT_REQUIRED)
         self._name = f"veilface{os.getpid()}"
         self._hosts = range(hosts)
         self._left = ExitStack()
@@ -55,9 +56,9 @@ class Network:
                 for host in self._hosts:
                     self._add(host, entered)
             except subprocess.CalledProcessError as error:
-                not_permitted(f"no network namespaces: {error.stderr.strip()}")
+                absent(f"no network namespaces: {error.stderr.strip()}", ROOT_REQUIRED)
             except PermissionError as error:
-                not_permitted(f"no network namespaces: {error}")
+                absent(f"no network namespaces: {error}", ROOT_REQUIRED)
             self._left = entered.pop_all()
         return self
 

@@ -18,6 +18,7 @@ from playwright.sync_api import Browser, expect, sync_playwright
 from models.pack import ModelPack
 from tests.clients.conftest import Running
 from tests.patience import PATIENCE_S
+from tests.required import absent
 from tests.web.browser_tab import BrowserTab
 from tests.web.camera import FakeCamera
 from tests.web.deployments import (
@@ -47,9 +48,7 @@ def chromium() -> Path:
     found = installed_browser()
     if found is None:
         reason = f"no browser is installed: none of {', '.join(NAMES)}"
-        if os.environ.get("VEILFACE_REQUIRE_BROWSER") == "1":
-            pytest.fail(f"{reason}, and VEILFACE_REQUIRE_BROWSER=1 asks for one")
-        pytest.skip(reason)
+        absent(reason, "VEILFACE_REQUIRE_BROWSER")
     return Path(found)
 
 

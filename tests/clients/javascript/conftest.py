@@ -10,6 +10,8 @@ from typing import Any
 
 import pytest
 
+from tests.required import absent
+
 PACKAGE = Path(__file__).resolve().parents[3] / "clients" / "javascript"
 
 Node = Callable[..., Any]
@@ -34,9 +36,7 @@ def require_client() -> str:
     elif not (PACKAGE / "node_modules" / "onnxruntime-web").is_dir() or not _built():
         missing = "the JavaScript client is not built: run `make javascript`"
     if missing is not None:
-        if os.environ.get("VEILFACE_REQUIRE_NODE") == "1":
-            pytest.fail(missing)
-        pytest.skip(missing)
+        absent(missing, "VEILFACE_REQUIRE_NODE")
     return str(executable)
 
 
