@@ -11,7 +11,6 @@ import threading
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +22,18 @@ from models.headers import animated, exif_orientation, read_head, unread_file, w
 FORMATS = ("JPEG", "PNG", "WEBP", "BMP")
 SMALLER = "Send a smaller copy."
 
-# The most scans of any JPEG, however small. Encoders write about ten.
-MAX_JPEG_SCANS = 100
+MAX_BYTES = 10 * 2**20
+"""Of the file: a JPEG of a phone with 24 megapixels."""
+MAX_PIXELS = 24_000_000
+"""As the header states them."""
+MAX_SIDE = 16_384
+MAX_SCANS = 18
+"""Of a JPEG of `MAX_PIXELS`; a smaller one may have more in proportion, up to `MOST_SCANS`.
+
+Each scan walks over the whole picture, whatever few bytes it has: 90 over 24 megapixels in a file
+of 146 kB take nine times the work of decoding an ordinary photo of that size.
+"""
+MOST_SCANS = 100
 # RLE8 and RLE4: Pillow unpacks them in Python, 24 megapixels of 20 kB in 7 seconds.
 _BMP_RUNS = (1, 2)
 # Pixels are converted in strips of rows, so that no second whole picture is held.
@@ -38,7 +47,6 @@ limits admit, and the number of requests would multiply it."""
 
 # Pillow's own guard, as the error that it is from twice as many pixels on.
 warnings.simplefilter("error", Image.DecompressionBombWarning)
-
 
 _free = threading.Semaphore(MEGAPIXELS_AT_A_TIME)
 _next = threading.Lock()
@@ -57,23 +65,7 @@ def turn(pixels: int) -> Iterator[None]:
         _free.release(share)
 
 
-@dataclass(frozen=True, kw_only=True)
-class ImageLimits:
-    """What a picture may cost before its pixels are decoded."""
-
-    max_bytes: int = 10 * 2**20  # a 24 MP JPEG of a phone
-    max_pixels: int = 24_000_000  # as the header states them
-    max_side: int = 16_384
-    # Of a JPEG of `max_pixels`; a smaller one may have more in proportion. Each scan walks over the
-    # whole picture, whatever few bytes it has: 90 over 24 MP in a file of 146 kB take nine times
-    # the work of decoding an ordinary photo of that size.
-    max_scans: int = 18
-
-
-DEFAULT_LIMITS = ImageLimits()
-
-
-def decode_image(data: bytes, *, limits: ImageLimits = DEFAULT_LIMITS) -> NDArray[np.uint8]:
+def decode_image(data: bytes) -> NDArray[np.uint8]:
     """Decode a JPEG, PNG, WebP or BMP picture.
 
     The EXIF orientation is applied. Greyscale, palette, CMYK and 16-bit pictures are converted
@@ -85,8 +77,6 @@ def decode_image(data: bytes, *, limits: ImageLimits = DEFAULT_LIMITS) -> NDArra
     ----------
     data
         The encoded picture. Its name and declared type do not matter.
-    limits
-        Bytes, pixels, sides and scans, checked before pixels are decoded.
 
     Returns
     -------
@@ -101,14 +91,13 @@ def decode_image(data: bytes, *, limits: ImageLimits = DEFAULT_LIMITS) -> NDArra
     """
     if not data:
         raise ImageError("unsupported_image", "The photo is empty: send the complete file.")
-    if len(data) > limits.max_bytes:
+    if len(data) > MAX_BYTES:
         raise ImageError(
             "image_too_large",
-            f"The picture has {len(data)} bytes; at most {limits.max_bytes} are accepted."
-            f" {SMALLER}",
+            f"The picture has {len(data)} bytes; at most {MAX_BYTES} are accepted. {SMALLER}",
         )
     try:
-        image, orientation = _open(data, limits)
+        image, orientation = _open(data)
         with turn(image.width * image.height):
             with image:
                 image.load()
@@ -146,23 +135,23 @@ def image_size(data: bytes) -> tuple[int, int] | None:
     No pixel is decoded, and turns by EXIF are not applied.
     """
     try:
-        with _open(data, DEFAULT_LIMITS)[0] as image:
+        with _open(data)[0] as image:
             return image.size
     except Exception:  # parsers of damaged files raise almost anything
         return None
 
 
-def _open(data: bytes, limits: ImageLimits) -> tuple[Image.Image, int]:
+def _open(data: bytes) -> tuple[Image.Image, int]:
     """Open a picture whose header is within the limits; with its orientation by EXIF."""
     canvas = webp_canvas(data)
     if canvas is not None:
-        _check_size(*canvas, limits)
+        _check_size(*canvas)
     head = read_head(data)
     try:
         image = Image.open(io.BytesIO(head.data), formats=FORMATS)
     except UnidentifiedImageError:
         raise ImageError("unsupported_image", unread_file(data)) from None
-    _check_size(image.width, image.height, limits)
+    _check_size(image.width, image.height)
     if getattr(image, "is_animated", False):
         raise animated("WebP")
     if image.format == "BMP" and image.info["compression"] in _BMP_RUNS:
@@ -171,7 +160,7 @@ def _open(data: bytes, limits: ImageLimits) -> tuple[Image.Image, int]:
             "The BMP file is compressed: save it without compression, or as JPEG.",
         )
     pixels = image.width * image.height
-    most = min(MAX_JPEG_SCANS, limits.max_scans * limits.max_pixels // pixels)
+    most = min(MOST_SCANS, MAX_SCANS * MAX_PIXELS // pixels)
     if head.scans > most:
         raise ImageError(
             "unsupported_image",
@@ -183,12 +172,12 @@ def _open(data: bytes, limits: ImageLimits) -> tuple[Image.Image, int]:
     return image, head.orientation
 
 
-def _check_size(width: int, height: int, limits: ImageLimits) -> None:
-    if max(width, height) > limits.max_side or width * height > limits.max_pixels:
+def _check_size(width: int, height: int) -> None:
+    if max(width, height) > MAX_SIDE or width * height > MAX_PIXELS:
         raise ImageError(
             "image_too_large",
-            f"The picture has {width} x {height} pixels; at most {limits.max_pixels} pixels and"
-            f" {limits.max_side} on a side are accepted. {SMALLER}",
+            f"The picture has {width} x {height} pixels; at most {MAX_PIXELS} pixels and"
+            f" {MAX_SIDE} on a side are accepted. {SMALLER}",
         )
 
 

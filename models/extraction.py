@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.cache import EmbeddingCache
-from models.decoding import DEFAULT_LIMITS, decode_image
+from models.decoding import MAX_BYTES, decode_image
 from models.errors import FaceError, ImageError
 from models.pack import ModelPack
 from models.sessions import default_workers
@@ -38,7 +38,7 @@ class Photo:
         if isinstance(self.source, bytes):
             return self.source
         with self.source.open("rb") as file:
-            return file.read(DEFAULT_LIMITS.max_bytes + 1)
+            return file.read(MAX_BYTES + 1)
 
 
 Embeddings = tuple[NDArray[np.float32], ...]

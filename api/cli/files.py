@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from api.cli.errors import CommandError, UsageError
-from models.decoding import DEFAULT_LIMITS
+from models.decoding import MAX_BYTES
 from templates.keys.private_file import read_at_most
 
 MAX_CONTRACT_BYTES = 2**28
@@ -21,7 +21,7 @@ def read_bounded(path: Path, most: int) -> bytes:
 def read_photo(path: Path) -> bytes:
     """Read a photo that somebody named."""
     try:
-        return read_bounded(path, DEFAULT_LIMITS.max_bytes)
+        return read_bounded(path, MAX_BYTES)
     except FileNotFoundError:
         raise UsageError(f"no such photo: {path}") from None
 

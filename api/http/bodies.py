@@ -21,13 +21,13 @@ from starlette.requests import Request
 from api.http.errors import ApiError, refuse_unknown_names, wrong_value
 from api.http.requests import Body, how_to_send
 from api.limits.admission import MAX_JSON_BYTES, read_limited, stream_limited
-from models.decoding import DEFAULT_LIMITS
+from models.decoding import MAX_BYTES
 from templates.contract.canonical import too_many_parts
 
 _FORM, _JSON = "multipart/form-data", "application/json"
 _MEDIA_TYPE = re.compile(r"[a-z0-9.+-]{1,63}/[a-z0-9.+-]{1,63}")
 MAX_REQUEST_BYTES = 32 * 2**20
-MAX_IMAGE_BYTES = DEFAULT_LIMITS.max_bytes
+MAX_IMAGE_BYTES = MAX_BYTES
 MAX_FIELD_BYTES = 4096
 MAX_FIELDS = 16
 BODY_TIMEOUT_S = 60.0

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from PIL import Image, PngImagePlugin
 
-from models.decoding import DEFAULT_LIMITS
+from models.decoding import MAX_BYTES, MAX_PIXELS, MAX_SIDE
 from models.synthetic import draw_face
 from tests.fuzz.mutations import CAP, mutated, some
 
@@ -200,8 +200,8 @@ class Pictures:
     @cached_property
     def largest(self) -> list[bytes]:
         """Small files that unpack to as many pixels as are accepted."""
-        size = (6000, DEFAULT_LIMITS.max_pixels // 6000)
-        narrow = (DEFAULT_LIMITS.max_side, DEFAULT_LIMITS.max_pixels // DEFAULT_LIMITS.max_side)
+        size = (6000, MAX_PIXELS // 6000)
+        narrow = (MAX_SIDE, MAX_PIXELS // MAX_SIDE)
         return [
             encoded(Image.new("RGBA", size), "PNG", compress_level=9),
             encoded(Image.new("I;16", narrow), "PNG", compress_level=9),
@@ -239,5 +239,5 @@ class Pictures:
             data = rng.choice(self.largest)
             return data if rng.random() < 0.5 else mutated(rng, data, self.everything)
         one, chunks = hostile_chunk(rng), png_chunks(self.sound["PNG"][0])
-        room = (DEFAULT_LIMITS.max_bytes - CAP) // len(chunk(*one))
+        room = (MAX_BYTES - CAP) // len(chunk(*one))
         return png([chunks[0], *[one] * max(1, room), *chunks[1:]])

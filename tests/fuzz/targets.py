@@ -58,7 +58,7 @@ def demand(holds: bool, promise: str) -> None:
 
 def image(folder: Path) -> Target:
     """``models.decoding``: any picture of a request."""
-    from models.decoding import BYTES_PER_PIXEL, DEFAULT_LIMITS, decode_image, image_size
+    from models.decoding import BYTES_PER_PIXEL, MAX_PIXELS, MAX_SIDE, decode_image, image_size
     from models.errors import ImageError
     from tests.fuzz import regressions
     from tests.fuzz.pictures import Pictures
@@ -71,10 +71,10 @@ def image(folder: Path) -> Target:
         height, width, channels = pixels.shape
         demand(pixels.dtype == np.uint8 and channels == 3, "8-bit RGB")
         demand(pixels.flags.c_contiguous, "C-contiguous")
-        demand(max(height, width) <= DEFAULT_LIMITS.max_side, "no side above the limit")
-        demand(height * width <= DEFAULT_LIMITS.max_pixels, "no more pixels than the limit")
+        demand(max(height, width) <= MAX_SIDE, "no side above the limit")
+        demand(height * width <= MAX_PIXELS, "no more pixels than the limit")
 
-    most = DEFAULT_LIMITS.max_pixels * BYTES_PER_PIXEL // MIB + 1
+    most = MAX_PIXELS * BYTES_PER_PIXEL // MIB + 1
     return Target(read, (ImageError,), Pictures().make, most, regressions.pictures())
 
 

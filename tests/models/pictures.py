@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from models.decoding import ImageLimits, decode_image
+from models.decoding import decode_image
 from models.errors import ImageError
 
 
@@ -63,10 +63,10 @@ def oriented(orientation: int) -> Image.Exif:
     return exif
 
 
-def refusal(data: bytes, **limits: int) -> ImageError:
+def refusal(data: bytes) -> ImageError:
     """The error that refuses a file; its message is a sentence, and quotes no cause."""
     with pytest.raises(ImageError) as caught:
-        decode_image(data, limits=ImageLimits(**limits))
+        decode_image(data)
     assert str(caught.value).endswith(".")
     assert caught.value.__cause__ is None
     return caught.value

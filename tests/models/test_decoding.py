@@ -7,7 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image, PngImagePlugin
 
-from models.decoding import ImageLimits, decode_image
+from models import decoding
+from models.decoding import decode_image
 from models.errors import ImageError
 from tests.models.pictures import encode, in_scans, oriented, picture, png, refusal
 
@@ -136,22 +137,23 @@ def test_what_is_not_read_is_named(said, data):
     assert error.code == "unsupported_image"
 
 
-def test_limits_on_bytes_pixels_and_sides():
+def test_limits_on_bytes_pixels_and_sides(monkeypatch):
     data = encode(PHOTO)
-    for limits in ({"max_bytes": len(data) - 1}, {"max_pixels": 40 * 60 - 1}, {"max_side": 59}):
-        error = refusal(data, **limits)
+    for name, most in (("MAX_BYTES", len(data)), ("MAX_PIXELS", 40 * 60), ("MAX_SIDE", 60)):
+        monkeypatch.setattr(decoding, name, most - 1)
+        error = refusal(data)
         assert error.code == "image_too_large"
         assert str(error).endswith(" Send a smaller copy.")
+        monkeypatch.setattr(decoding, name, most)
     assert "60 x 40 pixels; " in str(error)
-    exact = ImageLimits(max_bytes=len(data), max_pixels=2400, max_side=60)
-    assert decode_image(data, limits=exact).shape == (40, 60, 3)
+    assert decode_image(data).shape == (40, 60, 3)
 
 
 @pytest.mark.parametrize(("pixels", "scans"), [(64 * 64, 18), (2 * 64 * 64, 36), (10**9, 100)])
-def test_a_small_picture_may_have_more_scans_in_proportion(pixels, scans):
-    limits = ImageLimits(max_pixels=pixels)
-    assert decode_image(in_scans(scans), limits=limits).shape == (64, 64, 3)
-    assert refusal(in_scans(scans + 1), max_pixels=pixels).code == "unsupported_image"
+def test_a_small_picture_may_have_more_scans_in_proportion(pixels, scans, monkeypatch):
+    monkeypatch.setattr(decoding, "MAX_PIXELS", pixels)
+    assert decode_image(in_scans(scans)).shape == (64, 64, 3)
+    assert refusal(in_scans(scans + 1)).code == "unsupported_image"
 
 
 def samples() -> list[bytes]:

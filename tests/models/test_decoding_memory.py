@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from models.decoding import BYTES_PER_PIXEL, ImageLimits, turn
+from models.decoding import BYTES_PER_PIXEL, MAX_PIXELS, turn
 from tests.models.pictures import encode, png, refusal
 from tests.patience import PATIENCE_S
 
@@ -63,7 +63,7 @@ LARGEST = {
 def test_the_largest_picture_that_is_accepted_takes_the_stated_memory(mode, share, tmp_path):
     """And one of a quarter of its pixels, in less time."""
     kind, options = LARGEST[mode]
-    pixels = ImageLimits().max_pixels // share
+    pixels = MAX_PIXELS // share
     size = (3000, pixels // 3000)
     assert size[0] * size[1] == pixels
     large, small = tmp_path / "large", tmp_path / "small"

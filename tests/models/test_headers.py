@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from models.decoding import ImageLimits, decode_image
+from models import decoding
+from models.decoding import decode_image
 from models.headers import MAX_JPEG_SEGMENTS, MAX_PNG_CHUNKS, exif_orientation, read_head
 from tests.models.pictures import (
     behind_start,
@@ -144,14 +145,14 @@ def test_scans_cannot_be_hidden(between):
     np.testing.assert_array_equal(decode_image(data), decode_image(in_scans(14)))
 
 
-def test_only_scans_of_the_picture_itself_count():
+def test_only_scans_of_the_picture_itself_count(monkeypatch):
     thumbnail = in_scans(90)
     exif = segment(0xE1, b"Exif\0\0" + thumbnail)
     still = encode(Image.fromarray(picture(64, 64)), "JPEG", progressive=True)
     film = b"\xff\xda" * 1000
     photo = behind_start(still, exif) + in_scans(90) + film
-    limits = ImageLimits(max_pixels=64 * 64)
-    np.testing.assert_array_equal(decode_image(photo, limits=limits), decode_image(still))
+    monkeypatch.setattr(decoding, "MAX_PIXELS", 64 * 64)
+    np.testing.assert_array_equal(decode_image(photo), decode_image(still))
 
 
 @pytest.mark.parametrize("name", [b"VP8 ", b"VP8L", b"VP8X"])

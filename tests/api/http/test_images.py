@@ -2,7 +2,6 @@
 
 from collections import Counter
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +10,7 @@ import pytest
 from PIL import Image
 
 from api.http.app import create_app
-from models import pack
-from models.decoding import ImageLimits, decode_image
+from models import decoding
 from tests.api.awkward import Case, bombs, damaged, encode, no_pictures, scenes, unusual
 from tests.api.client import Client
 from tests.api.deployment import (
@@ -55,8 +53,7 @@ def failures(client: Client, cases: list[Case]) -> list[str]:
 def smaller_photos() -> Iterator[None]:
     """Bombs of so few pixels take a second less each to make."""
     with pytest.MonkeyPatch.context() as patch:
-        limits = ImageLimits(max_pixels=MAX_PIXELS)
-        patch.setattr(pack, "decode_image", partial(decode_image, limits=limits))
+        patch.setattr(decoding, "MAX_PIXELS", MAX_PIXELS)
         yield
 
 
