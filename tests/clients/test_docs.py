@@ -8,11 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from api.http.errors import ERROR_CODES
 from tests.api.deployment import photo
 from tests.clients.conftest import VEILFACE, Running
 from veilface_client import Client
-from veilface_client.errors import ServiceError, error_class
 
 ROOT = Path(__file__).resolve().parents[2]
 CLIENT, DISTRIBUTION = PAGES = ("docs/python.md", "clients/python/README.md")
@@ -79,14 +77,3 @@ def test_the_same_from_the_shell(service: Running, newcomer: tuple[Path, dict[st
     )
     assert done.returncode == 0, done.stderr
     assert '"decision":"accept"' in done.stdout.replace(": ", ":")
-
-
-def test_the_table_of_classes_is_that_of_the_code() -> None:
-    text = (ROOT / CLIENT).read_text(encoding="utf-8")
-    table = text.split("| class | codes |")[1].split("\n\n")[0]
-    rows = re.findall(r"^\| `(\w+)`.*? \| (.*) \|$", table, flags=re.MULTILINE)
-    stated = {code: name for name, codes in rows for code in re.findall(r"`(\w+)`", codes)}
-    classes = {code: error_class(code, error.status) for code, error in ERROR_CODES.items()}
-    assert stated == {
-        code: kind.__name__ for code, kind in classes.items() if kind is not ServiceError
-    }

@@ -226,18 +226,16 @@ def test_a_generator_of_another_contract(client: PrivateClient, service: Scripte
 
 
 def test_lifts_hold_the_projection_of_the_photos_mean(pack: Path) -> None:
-    lifter = Lifter(pack, dim=None)
     contract, generator = answers(pack)
-    inputs = lifter.keep(contract, generator)
-    assert lifter.keep(contract, generator) is inputs
+    lifter = Lifter.load(pack, contract, generator)
     photos = [photo(1, 0), photo(1, 1)]
     models = ModelPack.load(pack, threads=1)
     mean = sum(models.embed_photo(each).embedding for each in photos)
     point = SOURCE.reduced(40).project((mean / np.linalg.norm(mean))[None])
     lifted = [
-        lifter.lift(Enrollable, inputs, photos, None),
-        lifter.lift(Probe, inputs, photos, None),
-        Lifter(pack, dim=2).lift(Probe, inputs, photos, "largest"),
+        lifter.lift(Enrollable, photos, None, None),
+        lifter.lift(Probe, photos, None, None),
+        lifter.lift(Probe, photos, 2, "largest"),
     ]
     for lift, m in zip(lifted, (8, 4, 2), strict=True):
         received = wire.decode(lift.template)
@@ -265,12 +263,12 @@ def test_what_does_not_serve_is_said_without_a_lift(pack: Path, tmp_path: Path) 
     ]
     for folder, public, decoys, message in cases:
         with pytest.raises(LiftFailed, match=message):
-            Lifter(folder, dim=None).keep(public, decoys)
+            Lifter.load(folder, public, decoys)
 
     def refused(photos: Sequence[bytes], dim: int | None = None, **changes: Any) -> str:
-        lifter = Lifter(pack, dim=dim)
+        lifter = Lifter.load(pack, *answers(pack, **changes))
         with pytest.raises(LiftFailed) as failed:
-            lifter.lift(Probe, lifter.keep(*answers(pack, **changes)), photos, None)
+            lifter.lift(Probe, photos, dim, None)
         return failed.value.message
 
     assert "of dimension 2, 4, not 5" in refused([photo(1)], 5)
@@ -282,11 +280,8 @@ def test_what_does_not_serve_is_said_without_a_lift(pack: Path, tmp_path: Path) 
 
 def test_without_the_library(monkeypatch: pytest.MonkeyPatch, pack: Path) -> None:
     monkeypatch.setitem(sys.modules, "enroll.public_contract", None)
-    with pytest.raises(LiftFailed, match="call no package of yours"):
-        Lifter(pack, dim=None).keep(*answers(pack))
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(LiftFailed, match=r"veilface-client\[private\]"):
-        PrivateClient("http://service.test", TOKEN, pack=pack)
+    with pytest.raises(LiftFailed, match=r"veilface-client\[private\].* no package of yours"):
+        Lifter.load(pack, *answers(pack))
 
 
 LIFT_ALONE = """
@@ -296,9 +291,8 @@ sys.modules.update(dict.fromkeys(blocked))
 from veilface_client import LiftFailed, Probe
 from veilface_client.lifting import Lifter
 folder, answers, photo = pickle.load(sys.stdin.buffer)
-lifter = Lifter(folder, dim=None)
 try:
-    print(lifter.lift(Probe, lifter.keep(*answers), [photo], None))
+    print(Lifter.load(folder, *answers).lift(Probe, [photo], None, None))
 except LiftFailed as error:
     print(error)
 """

@@ -1,7 +1,8 @@
 """When a call is sent again, and that a write which is sent again is done once."""
 
-from collections.abc import Callable
-from typing import Any
+import asyncio
+from collections.abc import Callable, Coroutine
+from typing import Any, TypeVar
 
 import httpx
 import pytest
@@ -10,7 +11,10 @@ from tests.api.deployment import photo
 from tests.clients.conftest import Running
 from tests.clients.proxy import Proxy
 from veilface_client import Client, ConnectionFailed, LockedOut, Retries, VeilfaceError
-from veilface_client.flows import Flow, PhotoFlows, Send
+from veilface_client.calls import PhotoCalls
+
+T = TypeVar("T")
+Call = Callable[[PhotoCalls], Coroutine[Any, Any, object]]
 
 ENROLLED = {
     "template_id": "t",
@@ -47,36 +51,49 @@ def answer(step: Step, content: dict[str, Any]) -> httpx.Response:
     return httpx.Response(status, json=error, headers=headers)
 
 
+class Channel:
+    """Gives these answers, then a good one; keeps how long it was told to wait."""
+
+    def __init__(self, steps: list[Step], content: dict[str, Any]) -> None:
+        self.script = iter(steps)
+        self.content = content
+        self.sendings = 0
+        self.waits: list[float] = []
+
+    async def request(self, *_: str, **__: Any) -> httpx.Response:
+        self.sendings += 1
+        return answer(next(self.script, (200, None, None)), self.content)
+
+    async def sleep(self, seconds: float) -> None:
+        self.waits.append(seconds)
+
+    async def run(self, function: Callable[..., T], *args: Any) -> T:
+        return function(*args)
+
+
 def driven(
-    flow: Flow[Any], steps: list[Step], content: dict[str, Any]
+    call: Call, steps: list[Step], content: dict[str, Any], retries: Retries
 ) -> tuple[int, list[float], Exception | None]:
-    """Drive a flow through these answers, then a good one: sendings, pauses, and its error."""
-    script = iter(steps)
-    sendings, waits, came = 0, [], None
+    """Run a call through these answers, then a good one: sendings, pauses, and its error."""
+    channel = Channel(steps, content)
+    error = None
     try:
-        step = next(flow)
-        while True:
-            if isinstance(step, Send):
-                sendings += 1
-                try:
-                    came = answer(next(script, (200, None, None)), content)
-                except httpx.RequestError as error:
-                    step = flow.throw(error)
-                    continue
-            elif isinstance(step, float):
-                waits.append(step)
-                came = None
-            else:
-                came = step()
-            step = flow.send(came)
-    except StopIteration:
-        return sendings, waits, None
-    except VeilfaceError as error:
-        return sendings, waits, error
+        asyncio.run(call(PhotoCalls(channel, retries)))
+    except VeilfaceError as raised:
+        error = raised
+    return channel.sendings, channel.waits, error
 
 
-def enroll(retries: Retries, *, replace: bool = True) -> Flow[Any]:
-    return PhotoFlows(retries).enroll("anna", b"photo", replace=replace)
+def enroll(calls: PhotoCalls) -> Coroutine[Any, Any, object]:
+    return calls.enroll("anna", b"photo")
+
+
+def enroll_if_new(calls: PhotoCalls) -> Coroutine[Any, Any, object]:
+    return calls.enroll("anna", b"photo", replace=False)
+
+
+def verify(calls: PhotoCalls) -> Coroutine[Any, Any, object]:
+    return calls.verify("anna", b"photo")
 
 
 @pytest.mark.parametrize(
@@ -103,39 +120,33 @@ def enroll(retries: Retries, *, replace: bool = True) -> Flow[Any]:
     ],
 )
 def test_what_is_sent_again(step: Step, write_again: bool, verification_again: bool) -> None:
-    retries = Retries()
-    cases: list[tuple[Callable[[], Flow[Any]], dict[str, Any], bool]] = [
-        (lambda: enroll(retries), ENROLLED, write_again),
-        (lambda: enroll(retries, replace=False), ENROLLED, verification_again),
-        (lambda: PhotoFlows(retries).verify("anna", b"photo"), DECIDED, verification_again),
+    cases: list[tuple[Call, dict[str, Any], bool]] = [
+        (enroll, ENROLLED, write_again),
+        (enroll_if_new, ENROLLED, verification_again),
+        (verify, DECIDED, verification_again),
     ]
-    for flow, content, again in cases:
-        sendings, waits, error = driven(flow(), [step], content)
+    for call, content, again in cases:
+        sendings, waits, error = driven(call, [step], content, Retries())
         assert (sendings, len(waits)) == ((2, 1) if again else (1, 0))
         assert (error is None) is again
         assert error is None or error.__suppress_context__
 
 
 def test_sendings_are_bounded_and_waits_grow_with_jitter() -> None:
-    sendings, waits, error = driven(
-        enroll(Retries(sendings=7, patience_s=2.0)), [GATEWAY] * 9, ENROLLED
-    )
+    patient = Retries(sendings=7, patience_s=2.0)
+    sendings, waits, error = driven(enroll, [GATEWAY] * 9, ENROLLED, patient)
     assert (sendings, type(error).__name__) == (7, "Unavailable")
     bounds = [0.25, 0.5, 1, 2, 2, 2]
     assert all(0 <= wait <= most for wait, most in zip(waits, bounds, strict=True))
     assert len(set(waits)) == 6
-    assert driven(enroll(Retries(sendings=1)), [OVERLOADED], ENROLLED)[0] == 1
+    assert driven(enroll, [OVERLOADED], ENROLLED, Retries(sendings=1))[0] == 1
 
 
 def test_the_service_is_waited_for_as_long_as_it_says() -> None:
     steps: list[Step] = [(429, "rate_limited", "7"), STORE]
-    _, waits, _ = driven(enroll(Retries()), steps, ENROLLED)
+    _, waits, _ = driven(enroll, steps, ENROLLED, Retries())
     assert 7 <= waits[0] <= 7.25
     assert 5 <= waits[1] <= 5.5
-
-
-def test_ready_is_asked_once() -> None:
-    assert driven(PhotoFlows(Retries()).ready(), [OVERLOADED], {"status": "ok"})[0] == 1
 
 
 def test_a_write_whose_answer_was_lost_is_sent_again(service: Running, token: str) -> None:

@@ -6,6 +6,7 @@ embeds and lifts on this machine and sends private templates only. What the serv
 """
 
 from veilface_client import results
+from veilface_client.calls import Retries, new_holder_key
 from veilface_client.client import AsyncClient, Client, PrivateClient
 from veilface_client.errors import (
     ConnectionFailed,
@@ -23,7 +24,6 @@ from veilface_client.errors import (
     UnexpectedAnswer,
     VeilfaceError,
 )
-from veilface_client.flows import Retries, new_holder_key
 from veilface_client.photos import Photo
 from veilface_client.results import Enrollable, Probe
 

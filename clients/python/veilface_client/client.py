@@ -1,24 +1,22 @@
-"""The clients: flows driven by blocking calls, or by asyncio."""
+"""The clients: the calls on asyncio, and the same calls driven without it."""
 
 import asyncio
-import inspect
 import os
 import re
 import ssl
 import time
-from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
-from functools import update_wrapper
-from typing import Any, Concatenate, ParamSpec, Self, TypedDict, TypeVar, Unpack, get_args
+from collections.abc import Callable, Coroutine, Iterator
+from functools import wraps
+from pathlib import Path
+from typing import Any, Concatenate, ParamSpec, Self, TypedDict, TypeVar, Unpack
 
 import httpx
 
 from veilface_client import results
-from veilface_client.flows import Flow, Flows, PhotoFlows, PrivateFlows, Retries, Send
-from veilface_client.lifting import Lifter
+from veilface_client.calls import Calls, PhotoCalls, PrivateCalls, Retries
 
 P = ParamSpec("P")
 T = TypeVar("T")
-M = TypeVar("M", bound=Callable[..., Any])
 
 # Less than the 5 s after which the service closes an idle connection: a request that meets the
 # close is lost, and a verification that is lost is not sent again.
@@ -69,42 +67,80 @@ def _connection(url: str, token: str, options: Options) -> dict[str, Any]:
     }
 
 
+class AsyncClient(PhotoCalls):
+    """As :class:`Client`, on asyncio."""
+
+    def __init__(self, url: str, token: str, **options: Unpack[Options]) -> None:
+        self._http = httpx.AsyncClient(**_connection(url, token, options))
+        super().__init__(_AsyncChannel(self._http), options.get("retries"))
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({str(self._http.base_url)!r})"
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.close()
+
+    async def close(self) -> None:
+        """Close the connections."""
+        await self._http.aclose()
+
+
+class _AsyncChannel:
+    def __init__(self, http: httpx.AsyncClient) -> None:
+        self._http = http
+
+    async def request(self, method: str, path: str, **content: Any) -> httpx.Response:
+        return await self._http.request(method, path, **content)
+
+    async def sleep(self, seconds: float) -> None:
+        await asyncio.sleep(seconds)
+
+    async def run(self, function: Callable[..., T], *args: Any) -> T:
+        return await asyncio.to_thread(function, *args)
+
+
+class _BlockingChannel:
+    """Never suspends a coroutine: it blocks instead."""
+
+    def __init__(self, http: httpx.Client) -> None:
+        self._http = http
+
+    async def request(self, method: str, path: str, **content: Any) -> httpx.Response:
+        return self._http.request(method, path, **content)
+
+    async def sleep(self, seconds: float) -> None:
+        time.sleep(seconds)
+
+    async def run(self, function: Callable[..., T], *args: Any) -> T:
+        return function(*args)
+
+
 def _blocking(
-    flow: Callable[Concatenate[Any, P], Flow[T]],
+    call: Callable[Concatenate[Any, P], Coroutine[Any, Any, T]],
 ) -> "Callable[Concatenate[_Session, P], T]":
-    """Make a flow a method of a blocking client, with its parameters and its docstring."""
+    """Make a call a method of a blocking client, with its parameters and its docstring."""
 
+    @wraps(call)
     def method(self: "_Session", /, *args: P.args, **kwargs: P.kwargs) -> T:
-        return self._run(flow(self._flows, *args, **kwargs))
+        try:
+            call(self._calls, *args, **kwargs).send(None)
+        except StopIteration as end:
+            result: T = end.value
+            return result
+        raise RuntimeError("a call over a blocking channel was suspended")
 
-    return _described(method, flow)
-
-
-def _asynchronous(
-    flow: Callable[Concatenate[Any, P], Flow[T]],
-) -> "Callable[Concatenate[_AsyncSession, P], Coroutine[Any, Any, T]]":
-    """Make a flow a method of an asynchronous client, with its parameters and its docstring."""
-
-    async def method(self: "_AsyncSession", /, *args: P.args, **kwargs: P.kwargs) -> T:
-        return await self._run(flow(self._flows, *args, **kwargs))
-
-    return _described(method, flow)
-
-
-def _described(method: M, flow: Callable[..., Flow[Any]]) -> M:
-    """Describe a method as its flow is, returning what the flow returns."""
-    signature = inspect.signature(flow)
-    result = get_args(signature.return_annotation)[-1]
-    update_wrapper(method, flow, updated=())
-    method.__signature__ = signature.replace(return_annotation=result)  # type: ignore[attr-defined]
     return method
 
 
 class _Session:
     """A blocking client's connections, and the calls that carry no face."""
 
-    def __init__(self, url: str, token: str, flows: Flows, options: Options) -> None:
-        self._flows = flows
+    _calls: Calls
+
+    def __init__(self, url: str, token: str, options: Options) -> None:
         self._http = httpx.Client(**_connection(url, token, options))
 
     def __repr__(self) -> str:
@@ -122,111 +158,24 @@ class _Session:
 
     def subjects(self, *, page_size: int = 100) -> Iterator[results.Subject]:
         """Iterate over all subjects, in the order of their ids, a page at a time."""
-        cursor: str | None = None
-        while True:
-            page = self.page(limit=page_size, cursor=cursor)
+        page = self.page(limit=page_size)
+        yield from page.subjects
+        while page.next_cursor is not None:
+            page = self.page(limit=page_size, cursor=page.next_cursor)
             yield from page.subjects
-            if (cursor := page.next_cursor) is None:
-                return
 
-    page = _blocking(Flows.page)
-    describe = _blocking(Flows.describe)
-    erase = _blocking(Flows.erase)
-    lockout = _blocking(Flows.lockout)
-    reset_lockout = _blocking(Flows.reset_lockout)
-    contract = _blocking(Flows.contract)
-    generator = _blocking(Flows.generator)
-    export = _blocking(Flows.export)
-    import_ = _blocking(Flows.import_)
-    create_token = _blocking(Flows.create_token)
-    token_outcome = _blocking(Flows.token_outcome)
-    ready = _blocking(Flows.ready)
-
-    def _run(self, flow: Flow[T]) -> T:
-        came: object = None
-        failed: Exception | None = None
-        while True:
-            try:
-                step = flow.send(came) if failed is None else flow.throw(failed)
-            except StopIteration as end:
-                result: T = end.value
-                return result
-            came = failed = None
-            try:
-                match step:
-                    case Send(method, path, content):
-                        came = self._http.request(method, path, **content)
-                    case float(seconds):
-                        time.sleep(seconds)
-                    case function:
-                        came = function()
-            except Exception as error:
-                failed = error
-
-
-class _AsyncSession:
-    """As :class:`_Session`, on asyncio."""
-
-    def __init__(self, url: str, token: str, flows: Flows, options: Options) -> None:
-        self._flows = flows
-        self._http = httpx.AsyncClient(**_connection(url, token, options))
-
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}({str(self._http.base_url)!r})"
-
-    async def __aenter__(self) -> Self:
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        await self.close()
-
-    async def close(self) -> None:
-        """Close the connections."""
-        await self._http.aclose()
-
-    async def subjects(self, *, page_size: int = 100) -> AsyncIterator[results.Subject]:
-        """Iterate over all subjects, in the order of their ids, a page at a time."""
-        cursor: str | None = None
-        while True:
-            page = await self.page(limit=page_size, cursor=cursor)
-            for subject in page.subjects:
-                yield subject
-            if (cursor := page.next_cursor) is None:
-                return
-
-    page = _asynchronous(Flows.page)
-    describe = _asynchronous(Flows.describe)
-    erase = _asynchronous(Flows.erase)
-    lockout = _asynchronous(Flows.lockout)
-    reset_lockout = _asynchronous(Flows.reset_lockout)
-    contract = _asynchronous(Flows.contract)
-    generator = _asynchronous(Flows.generator)
-    export = _asynchronous(Flows.export)
-    import_ = _asynchronous(Flows.import_)
-    create_token = _asynchronous(Flows.create_token)
-    token_outcome = _asynchronous(Flows.token_outcome)
-    ready = _asynchronous(Flows.ready)
-
-    async def _run(self, flow: Flow[T]) -> T:
-        came: object = None
-        failed: Exception | None = None
-        while True:
-            try:
-                step = flow.send(came) if failed is None else flow.throw(failed)
-            except StopIteration as end:
-                result: T = end.value
-                return result
-            came = failed = None
-            try:
-                match step:
-                    case Send(method, path, content):
-                        came = await self._http.request(method, path, **content)
-                    case float(seconds):
-                        await asyncio.sleep(seconds)
-                    case function:
-                        came = await asyncio.to_thread(function)
-            except Exception as error:
-                failed = error
+    page = _blocking(Calls.page)
+    describe = _blocking(Calls.describe)
+    erase = _blocking(Calls.erase)
+    lockout = _blocking(Calls.lockout)
+    reset_lockout = _blocking(Calls.reset_lockout)
+    contract = _blocking(Calls.contract)
+    generator = _blocking(Calls.generator)
+    export = _blocking(Calls.export)
+    import_ = _blocking(Calls.import_)
+    create_token = _blocking(Calls.create_token)
+    token_outcome = _blocking(Calls.token_outcome)
+    ready = _blocking(Calls.ready)
 
 
 class Client(_Session):
@@ -252,18 +201,19 @@ class Client(_Session):
     """
 
     def __init__(self, url: str, token: str, **options: Unpack[Options]) -> None:
-        super().__init__(url, token, PhotoFlows(options.get("retries")), options)
+        super().__init__(url, token, options)
+        self._calls = PhotoCalls(_BlockingChannel(self._http), options.get("retries"))
 
-    enroll = _blocking(PhotoFlows.enroll)
-    challenge = _blocking(PhotoFlows.challenge)
-    verify = _blocking(PhotoFlows.verify)
-    compare = _blocking(PhotoFlows.compare)
+    enroll = _blocking(PhotoCalls.enroll)
+    challenge = _blocking(PhotoCalls.challenge)
+    verify = _blocking(PhotoCalls.verify)
+    compare = _blocking(PhotoCalls.compare)
 
 
 class PrivateClient(_Session):
     """Embeds and lifts in this process, and sends private templates only.
 
-    Needs the extra ``private``; :class:`LiftFailed` where it is not installed.
+    Needs the extra ``private``: without it, a lift raises :class:`LiftFailed`.
 
     Parameters
     ----------
@@ -284,22 +234,11 @@ class PrivateClient(_Session):
         dim: int | None = None,
         **options: Unpack[Options],
     ) -> None:
-        flows = PrivateFlows(options.get("retries"), Lifter(pack, dim=dim))
-        super().__init__(url, token, flows, options)
+        super().__init__(url, token, options)
+        channel = _BlockingChannel(self._http)
+        self._calls = PrivateCalls(channel, options.get("retries"), pack=Path(pack), dim=dim)
 
-    enroll = _blocking(PrivateFlows.enroll)
-    verify = _blocking(PrivateFlows.verify)
-    lift_enrollment = _blocking(PrivateFlows.lift_enrollment)
-    lift = _blocking(PrivateFlows.lift)
-
-
-class AsyncClient(_AsyncSession):
-    """As :class:`Client`, on asyncio."""
-
-    def __init__(self, url: str, token: str, **options: Unpack[Options]) -> None:
-        super().__init__(url, token, PhotoFlows(options.get("retries")), options)
-
-    enroll = _asynchronous(PhotoFlows.enroll)
-    challenge = _asynchronous(PhotoFlows.challenge)
-    verify = _asynchronous(PhotoFlows.verify)
-    compare = _asynchronous(PhotoFlows.compare)
+    enroll = _blocking(PrivateCalls.enroll)
+    verify = _blocking(PrivateCalls.verify)
+    lift_enrollment = _blocking(PrivateCalls.lift_enrollment)
+    lift = _blocking(PrivateCalls.lift)

@@ -15,7 +15,7 @@
     │   └── Unavailable         no pack, no database, or too much to do
     ├── ConnectionFailed        no answer: .sent says whether the request may have been done
     ├── UnexpectedAnswer        an answer that is not the service's
-    └── LiftFailed              no template was made on this machine: .message
+    └── LiftFailed              no template was made on this machine
 
 All other codes are plain `ServiceError`s, or have the class of their status. No error repeats the
 API key, a photo, or a template.
@@ -24,6 +24,7 @@ API key, a photo, or a template.
 from typing import TYPE_CHECKING, Any
 
 import httpx
+from pydantic import BaseModel, ValidationError
 
 if TYPE_CHECKING:
     from veilface_client.results import Lift
@@ -34,6 +35,8 @@ class VeilfaceError(Exception):
 
     Attributes
     ----------
+    message
+        For people; it may change.
     lift
         What a private client had lifted when it failed, and what to repeat the call with in the
         place of the photos: the service may have it. None where there is none, or where it does
@@ -41,6 +44,10 @@ class VeilfaceError(Exception):
     """
 
     lift: "Lift | None" = None
+
+    def __init__(self, message: str) -> None:
+        super().__init__(message)
+        self.message = message
 
 
 class ServiceError(VeilfaceError):
@@ -53,8 +60,6 @@ class ServiceError(VeilfaceError):
         because a proxy gave it.
     status
         The HTTP status.
-    message
-        For people; it may change.
     details
         What the service adds, by code.
     request_id
@@ -73,14 +78,16 @@ class ServiceError(VeilfaceError):
         request_id: str | None,
         retry_after: float | None,
     ) -> None:
-        request = "" if request_id is None else f", request {request_id}"
-        super().__init__(f"{message} ({code}{request})")
+        super().__init__(message)
         self.code = code
         self.status = status
-        self.message = message
         self.details = details
         self.request_id = request_id
         self.retry_after = retry_after
+
+    def __str__(self) -> str:
+        request = "" if self.request_id is None else f", request {self.request_id}"
+        return f"{self.message} ({self.code}{request})"
 
 
 class PhotoRefused(ServiceError):
@@ -134,22 +141,21 @@ class UnexpectedAnswer(VeilfaceError):
 class LiftFailed(VeilfaceError):
     """No template was made: ``message`` says which photo, pack, contract or decoys do not serve."""
 
-    def __init__(self, message: str) -> None:
-        super().__init__(message)
-        self.message = message
 
-
+_PHOTO_CODES = (
+    "no_face",
+    "multiple_faces",
+    "face_too_small",
+    "low_quality",
+    "inconsistent_images",
+    "unsupported_image",
+    "image_too_large",
+)
 _BY_CODE: dict[str, type[ServiceError]] = {
     "not_enrolled": NotEnrolled,
     "contract_mismatch": ContractMismatch,
     "enrollment_conflict": EnrollmentConflict,
-    "unsupported_image": PhotoRefused,
-    "image_too_large": PhotoRefused,
-    "no_face": PhotoRefused,
-    "multiple_faces": PhotoRefused,
-    "face_too_small": PhotoRefused,
-    "low_quality": PhotoRefused,
-    "inconsistent_images": PhotoRefused,
+    **dict.fromkeys(_PHOTO_CODES, PhotoRefused),
 }
 _BY_STATUS: dict[int, type[ServiceError]] = {
     401: Unauthorized,
@@ -162,9 +168,15 @@ _BY_STATUS: dict[int, type[ServiceError]] = {
 }
 
 
-def error_class(code: str, status: int) -> type[ServiceError]:
-    """Return the class of an error code, or of the status where the code has none of its own."""
-    return _BY_CODE.get(code) or _BY_STATUS.get(status, ServiceError)
+class _Error(BaseModel):
+    code: str
+    message: str
+    details: dict[str, Any] = {}
+
+
+class _ErrorAnswer(BaseModel):
+    error: _Error
+    request_id: str | None = None
 
 
 def error_of(response: httpx.Response) -> VeilfaceError:
@@ -172,22 +184,18 @@ def error_of(response: httpx.Response) -> VeilfaceError:
     status = response.status_code
     if status < 400:
         return UnexpectedAnswer(f"the service never answers HTTP {status}; is the URL right?")
-    header = response.headers.get("Retry-After", "")
     try:
-        body = response.json()
-        error, request_id = body["error"], body.get("request_id")
-        code, message, details = error["code"], error["message"], error.get("details", {})
-        if not (isinstance(code, str) and isinstance(message, str) and isinstance(details, dict)):
-            raise TypeError
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        answer = _ErrorAnswer.model_validate_json(response.content)
+    except ValidationError:
         # A proxy's page may repeat the request's headers: nothing of it is passed on.
-        code, message = f"http_{status}", f"HTTP {status}, without an error of the service"
-        details, request_id = {}, None
-    return error_class(code, status)(
-        code,
-        message,
+        message = f"HTTP {status}, without an error of the service"
+        answer = _ErrorAnswer(error=_Error(code=f"http_{status}", message=message))
+    error = answer.error
+    header = response.headers.get("Retry-After", "")
+    kind = _BY_CODE.get(error.code) or _BY_STATUS.get(status, ServiceError)
+    return kind(
+        **dict(error),
         status=status,
-        details=details,
-        request_id=request_id if isinstance(request_id, str) else None,
+        request_id=answer.request_id,
         retry_after=float(header) if header.isascii() and header.isdigit() else None,
     )

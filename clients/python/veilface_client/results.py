@@ -16,7 +16,7 @@ from veilface_client.errors import UnexpectedAnswer
 class Value(BaseModel):
     """A frozen value."""
 
-    model_config = ConfigDict(frozen=True, extra="ignore")
+    model_config = ConfigDict(frozen=True)
 
     @classmethod
     def read(cls, response: httpx.Response) -> Self:
@@ -164,10 +164,6 @@ class Subject(Value):
     holder_key: bool = False
     created_at: AwareDatetime
     updated_at: AwareDatetime
-
-
-class SubjectAnswer(Subject, Answer):
-    """One subject."""
 
 
 class SubjectPage(Answer):

@@ -1,13 +1,7 @@
 """Every call of the service, written once: what is sent, what comes back, when it is sent again.
 
-A flow is a generator. It yields what is to be done, is sent what came of it, and returns the
-result::
-
-    a Send      ─▶ httpx.Response, or an httpx error thrown into the flow
-    seconds     ─▶ None, after a pause
-    a function  ─▶ what it returns; it blocks (files, lifting)
-
-``client.py`` drives flows, blocking or on asyncio. Nothing here does I/O.
+The calls are coroutines over a :class:`Channel`. On asyncio they are the client; a blocking client
+runs them over a channel that never suspends them, so that each ends at its first step.
 """
 
 import base64
@@ -16,10 +10,12 @@ import random
 import re
 import secrets
 import unicodedata
-from collections.abc import Callable, Generator, Iterable, Mapping
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
-from typing import Any, Literal, TypeVar, cast
+from itertools import count
+from pathlib import Path
+from typing import Any, Literal, Protocol, TypeVar
 from urllib.parse import quote
 
 import httpx
@@ -34,7 +30,7 @@ from veilface_client.errors import (
     VeilfaceError,
     error_of,
 )
-from veilface_client.lifting import Lifter, LiftInputs
+from veilface_client.lifting import Lifter
 from veilface_client.photos import Photo, read_photos
 
 T = TypeVar("T")
@@ -47,16 +43,17 @@ Action = Literal["verify", "enroll"]
 HOLDER_KEY_BYTES = 32
 
 
-@dataclass(frozen=True, repr=False)
-class Send:
-    """One request; ``content`` is what httpx builds it of (``json``, ``files``, ``params`` …)."""
+class Channel(Protocol):
+    """How requests travel, and how a client waits."""
 
-    method: str
-    path: str
-    content: Mapping[str, Any]
+    async def request(self, method: str, path: str, **content: Any) -> httpx.Response:
+        """Send one request; ``content`` is what httpx builds it of (``json``, ``files`` …)."""
 
+    async def sleep(self, seconds: float) -> None:
+        """Pause."""
 
-Flow = Generator[Send | float | Callable[[], Any], Any, T]
+    async def run(self, function: Callable[..., T], *args: Any) -> T:
+        """Call a function that blocks: it reads files, or lifts."""
 
 
 @dataclass(frozen=True)
@@ -95,55 +92,66 @@ def _heals(error: VeilfaceError, repeatable: bool) -> bool:
 
 
 def new_holder_key() -> bytes:
-    """Make a key for one enrollment. Keep it where only the person, or their device, gets at it."""
+    """Make a key for one enrollment, which only the person or their device should hold."""
     return secrets.token_bytes(HOLDER_KEY_BYTES)
 
 
-class Flows:
+class Calls:
     """The calls that carry no face."""
 
-    def __init__(self, retries: Retries | None) -> None:
+    def __init__(self, channel: Channel, retries: Retries | None) -> None:
+        self._channel = channel
         self._retries = retries or Retries()
 
-    def page(self, *, limit: int = 100, cursor: str | None = None) -> Flow[results.SubjectPage]:
+    async def page(self, *, limit: int = 100, cursor: str | None = None) -> results.SubjectPage:
         """List one page of subjects. Right: ``enroll``."""
         params = _present(limit=limit, cursor=cursor)
-        return self._send(results.SubjectPage, "GET", "/v1/subjects", params=params)
+        return await self._send(results.SubjectPage, "GET", "/v1/subjects", params=params)
 
-    def describe(self, subject: str) -> Flow[results.SubjectAnswer]:
+    async def subjects(self, *, page_size: int = 100) -> AsyncIterator[results.Subject]:
+        """Iterate over all subjects, in the order of their ids, a page at a time."""
+        page = await self.page(limit=page_size)
+        while True:
+            for subject in page.subjects:
+                yield subject
+            if page.next_cursor is None:
+                return
+            page = await self.page(limit=page_size, cursor=page.next_cursor)
+
+    async def describe(self, subject: str) -> results.Subject:
         """Describe a subject, without its template. Right: ``enroll``."""
-        return self._send(results.SubjectAnswer, "GET", _path(subject))
+        return await self._send(results.Subject, "GET", _path(subject))
 
-    def erase(self, subject: str) -> Flow[results.Receipt]:
+    async def erase(self, subject: str) -> results.Receipt:
         """Erase a subject, for good; keep the receipt. Right: ``erase``."""
-        return self._send(results.Receipt, "DELETE", _path(subject))
+        return await self._send(results.Receipt, "DELETE", _path(subject))
 
-    def lockout(self, subject: str) -> Flow[results.Lockout]:
+    async def lockout(self, subject: str) -> results.Lockout:
         """Count the failed attempts; ``not_found`` where there are none. Right: ``admin``."""
-        return self._send(results.Lockout, "GET", _path(subject, "/lockout"))
+        return await self._send(results.Lockout, "GET", _path(subject, "/lockout"))
 
-    def reset_lockout(self, subject: str) -> Flow[results.Unlocked]:
+    async def reset_lockout(self, subject: str) -> results.Unlocked:
         """Forget the failed attempts, and enable the subject again. Right: ``admin``."""
-        return self._send(results.Unlocked, "DELETE", _path(subject, "/lockout"))
+        return await self._send(results.Unlocked, "DELETE", _path(subject, "/lockout"))
 
-    def contract(self) -> Flow[results.Contract]:
+    async def contract(self) -> results.Contract:
         """Fetch the contract in force, with the key of receipts."""
-        return self._send(results.Contract, "GET", "/v1/contract")
+        return await self._send(results.Contract, "GET", "/v1/contract")
 
-    def generator(self) -> Flow[results.Generator]:
+    async def generator(self) -> results.Generator:
         """Fetch the decoy generator. Right: ``embeddings``."""
-        return self._send(results.Generator, "GET", "/v1/contract/generator")
+        return await self._send(results.Generator, "GET", "/v1/contract/generator")
 
-    def export(self, subject: str) -> Flow[results.Export]:
+    async def export(self, subject: str) -> results.Export:
         """Export a subject, encrypted. Right: ``export``."""
-        return self._send(results.Export, "GET", _path(subject, "/export"))
+        return await self._send(results.Export, "GET", _path(subject, "/export"))
 
-    def import_(self, exported: str | results.Export) -> Flow[results.Imported]:
+    async def import_(self, exported: str | results.Export) -> results.Imported:
         """Import what :meth:`export` returned. Rights: ``export`` and ``admin``."""
-        text = exported.export if isinstance(exported, results.Export) else exported
-        return self._send(results.Imported, "POST", "/v1/subjects/import", json={"export": text})
+        body = {"export": exported.export if isinstance(exported, results.Export) else exported}
+        return await self._send(results.Imported, "POST", "/v1/subjects/import", json=body)
 
-    def create_token(
+    async def create_token(
         self,
         subject: str,
         action: Action,
@@ -151,7 +159,7 @@ class Flows:
         level: str | None = None,
         lifetime_s: int | None = None,
         replace: bool = True,
-    ) -> Flow[results.Token]:
+    ) -> results.Token:
         """Ask for a token for a browser. Right: ``verify`` or ``enroll``, as the action.
 
         With `replace` False its enrollment replaces nobody, as :meth:`enroll` with the same.
@@ -159,76 +167,72 @@ class Flows:
         _path(subject)
         body = _present(level=level, lifetime_s=lifetime_s, replace=None if replace else False)
         body |= {"subject_id": subject, "action": action}
-        return self._send(results.Token, "POST", "/v1/tokens", json=body)
+        return await self._send(results.Token, "POST", "/v1/tokens", json=body)
 
-    def token_outcome(self, subject: str, token_id: str) -> Flow[results.TokenOutcome]:
+    async def token_outcome(self, subject: str, token_id: str) -> results.TokenOutcome:
         """Ask what came of a token that this key asked for: never believe the page."""
         path = _path(subject, f"/tokens/{_id(token_id, 'a token_id')}")
-        return self._send(results.TokenOutcome, "GET", path)
+        return await self._send(results.TokenOutcome, "GET", path)
 
-    def ready(self) -> Flow[results.Health]:
-        """Ask once whether the service can answer; otherwise :class:`Unavailable`."""
-        once = Retries(sendings=1)
-        return self._send(results.Health, "GET", "/health/ready", retries=once)
+    async def ready(self) -> results.Health:
+        """Ask whether the service can answer; otherwise :class:`Unavailable`."""
+        return await self._send(results.Health, "GET", "/health/ready")
 
-    def _enroll(
+    async def _enroll(
         self, subject: str, replace: bool | str, **content: Any
-    ) -> Flow[results.Enrollment]:
+    ) -> results.Enrollment:
         headers = {}
         if replace is False:
             headers["If-None-Match"] = "*"
         elif replace is not True:
             headers["If-Match"] = f'"{_id(replace, "replace is True, False, or")}"'
-        # One that may replace only something would meet what its own first sending wrote.
-        return self._send(
+        return await self._send(
             results.Enrollment,
             "PUT",
             _path(subject, "/enrollment"),
+            # One that may replace only something would meet what its own first sending wrote.
             repeatable=replace is True,
             headers=headers,
             **content,
         )
 
-    def _verify(self, subject: str, **content: Any) -> Flow[results.Decision]:
+    async def _verify(self, subject: str, **content: Any) -> results.Decision:
         # One whose answer was lost may have been decided, and a rejection counts.
         path = _path(subject, "/verify")
-        return self._send(results.Decision, "POST", path, repeatable=False, **content)
+        return await self._send(results.Decision, "POST", path, repeatable=False, **content)
 
-    def _send(
+    async def _send(
         self,
         result: type[V],
         method: str,
         path: str,
         *,
         repeatable: bool = True,
-        retries: Retries | None = None,
         **content: Any,
-    ) -> Flow[V]:
+    ) -> V:
         """Send a request until it is answered, or the retries say that it is enough."""
-        retries = retries or self._retries
-        sending = 0
-        while True:
-            sending += 1
+        for sending in count(1):
             failure: VeilfaceError
             try:
-                response: httpx.Response = yield Send(method, path, content)
+                response = await self._channel.request(method, path, **content)
             except httpx.RequestError as error:
                 failure = _connection_failed(error)
             else:
                 if response.is_success:
                     return result.read(response)
                 failure = error_of(response)
-            wait = retries.wait(failure, sending=sending, repeatable=repeatable)
+            wait = self._retries.wait(failure, sending=sending, repeatable=repeatable)
             if wait is None:
                 # Without its cause: the texts of a protocol error may repeat a header.
                 raise failure from None
-            yield wait
+            await self._channel.sleep(wait)
+        raise AssertionError  # the count has no end
 
 
-class PhotoFlows(Flows):
+class PhotoCalls(Calls):
     """The calls of a client that sends photos."""
 
-    def enroll(
+    async def enroll(
         self,
         subject: str,
         photos: Photos,
@@ -237,7 +241,7 @@ class PhotoFlows(Flows):
         face: Face | None = None,
         holder_key: bytes | None = None,
         replace: bool | str = True,
-    ) -> Flow[results.Enrollment]:
+    ) -> results.Enrollment:
         """Enroll a subject, or replace its enrollment. Right: ``enroll``.
 
         Parameters
@@ -263,18 +267,18 @@ class PhotoFlows(Flows):
             face=face,
             holder_key=_encoded(holder_key),
         )
-        files = yield lambda: _files("images", photos)
-        return (yield from self._enroll(subject, replace, files=files, data=fields))
+        files = await self._files("images", photos)
+        return await self._enroll(subject, replace, files=files, data=fields)
 
-    def challenge(self, subject: str | None = None) -> Flow[results.Challenge]:
+    async def challenge(self, subject: str | None = None) -> results.Challenge:
         """Ask for a challenge of head movements, for one verification. Right: ``verify``.
 
         With a subject, it can be answered for that one only.
         """
         body = _present(subject_id=subject)
-        return self._send(results.Challenge, "POST", "/v1/challenges", json=body)
+        return await self._send(results.Challenge, "POST", "/v1/challenges", json=body)
 
-    def verify(
+    async def verify(
         self,
         subject: str,
         photos: Photos,
@@ -283,7 +287,7 @@ class PhotoFlows(Flows):
         face: Face | None = None,
         challenge: results.Challenge | None = None,
         holder_key: bytes | None = None,
-    ) -> Flow[results.Decision]:
+    ) -> results.Decision:
         """Check whether 1 to 5 photos of one person show the subject. Right: ``verify``.
 
         A rejection is no error: the decision is false. Each rejection counts once on the subject's
@@ -302,33 +306,39 @@ class PhotoFlows(Flows):
             challenge_id=None if challenge is None else challenge.challenge_id,
             holder_key=_encoded(holder_key),
         )
-        files = yield lambda: _files("image", photos)
-        return (yield from self._verify(subject, files=files, data=fields))
+        files = await self._files("image", photos)
+        return await self._verify(subject, files=files, data=fields)
 
-    def compare(
+    async def compare(
         self, first: Photo, second: Photo, *, level: str | None = None, face: Face | None = None
-    ) -> Flow[results.Decision]:
+    ) -> results.Decision:
         """Check whether two photos show one person; nothing is stored. Right: ``verify``.
 
         The `first` stands for an enrollment, and the `second` is decided as by :meth:`verify`. No
         attempt is counted on anybody, so a lost answer is asked for again.
         """
-        files = yield lambda: _files("images", [first, second])
-        fields = _present(level=level, face=face)
-        return (
-            yield from self._send(results.Decision, "POST", "/v1/compare", files=files, data=fields)
-        )
+        files = await self._files("images", [first, second])
+        data = _present(level=level, face=face)
+        return await self._send(results.Decision, "POST", "/v1/compare", files=files, data=data)
+
+    async def _files(self, field: str, photos: Photos) -> list[tuple[str, tuple[str, bytes, str]]]:
+        pictures = await self._channel.run(read_photos, photos)
+        # A file name of the user's machine is nobody else's business.
+        return [(field, ("photo", picture, "application/octet-stream")) for picture in pictures]
 
 
-class PrivateFlows(Flows):
+class PrivateCalls(Calls):
     """The calls of a client that never sends a face: it lifts here, and sends templates."""
 
-    def __init__(self, retries: Retries | None, lifter: Lifter) -> None:
-        super().__init__(retries)
-        self._lifter = lifter
-        self._is_current = True
+    def __init__(
+        self, channel: Channel, retries: Retries | None, *, pack: Path, dim: int | None
+    ) -> None:
+        super().__init__(channel, retries)
+        self._pack = pack
+        self._dim = dim
+        self._lifter: Lifter | None = None
 
-    def enroll(
+    async def enroll(
         self,
         subject: str,
         photos: Photos | results.Enrollable,
@@ -336,21 +346,19 @@ class PrivateFlows(Flows):
         face: Face | None = None,
         holder_key: bytes | None = None,
         replace: bool | str = True,
-    ) -> Flow[results.Enrollment]:
+    ) -> results.Enrollment:
         """Lift photos here (or take a lift of :meth:`lift_enrollment`), and enroll by it alone.
 
         Rights: ``enroll``, ``embeddings``. Never enroll the same photos twice: two lifts of them
         give the embedding away. After an error repeat with its ``lift``.
         """
         fields = _present(holder_key=_encoded(holder_key))
-        return self._lift_and_send(
-            results.Enrollable,
-            photos,
-            face,
-            lambda body: self._enroll(subject, replace, json=body | fields),
-        )
+        if not isinstance(photos, results.Enrollable):
+            photos = await self.lift_enrollment(photos, face=face)
+        with self._sending(photos):
+            return await self._enroll(subject, replace, json=_template(photos) | fields)
 
-    def verify(
+    async def verify(
         self,
         subject: str,
         photos: Photos | results.Probe,
@@ -358,54 +366,53 @@ class PrivateFlows(Flows):
         level: str | None = None,
         face: Face | None = None,
         holder_key: bytes | None = None,
-    ) -> Flow[results.Decision]:
+    ) -> results.Decision:
         """Lift photos of one person here (or take a probe of :meth:`lift`), and verify by it.
 
         Rights: ``verify``, ``embeddings``. After an error repeat with its ``lift``, never with the
         photos.
         """
         fields = _present(level=level, holder_key=_encoded(holder_key))
-        return self._lift_and_send(
-            results.Probe, photos, face, lambda body: self._verify(subject, json=body | fields)
-        )
+        if not isinstance(photos, results.Probe):
+            photos = await self.lift(photos, face=face)
+        with self._sending(photos):
+            return await self._verify(subject, json=_template(photos) | fields)
 
-    def lift_enrollment(
+    async def lift_enrollment(
         self, photos: Photos, *, face: Face | None = None
-    ) -> Flow[results.Enrollable]:
+    ) -> results.Enrollable:
         """Lift photos of one person here, and send nothing of them.
 
         :meth:`enroll` takes the lift, as often as it must: it is one and the same write.
         """
-        return self._lift(results.Enrollable, photos, face)
+        return await self._lift(results.Enrollable, photos, face)
 
-    def lift(self, photos: Photos, *, face: Face | None = None) -> Flow[results.Probe]:
+    async def lift(self, photos: Photos, *, face: Face | None = None) -> results.Probe:
         """Lift a probe here, of photos of one person; several subjects may be verified by it."""
-        return self._lift(results.Probe, photos, face)
+        return await self._lift(results.Probe, photos, face)
 
-    def _lift(self, kind: type[L], photos: Photos, face: Face | None) -> Flow[L]:
-        pictures: list[bytes] = yield lambda: read_photos(photos)
-        inputs = self._lifter.inputs if self._is_current else None
-        inputs = inputs or (yield from self._fetch())
-        lift: L = yield lambda: self._lifter.lift(kind, inputs, pictures, face)
-        return lift
+    async def _lift(self, kind: type[L], photos: Photos, face: Face | None) -> L:
+        pictures = await self._channel.run(read_photos, photos)
+        lifter = self._lifter = self._lifter or await self._load()
+        return await self._channel.run(lifter.lift, kind, pictures, self._dim, face)
 
-    def _lift_and_send(
-        self,
-        kind: type[L],
-        photos: Photos | L,
-        face: Face | None,
-        send: Callable[[dict[str, str]], Flow[T]],
-    ) -> Flow[T]:
-        """Send a lift. A resend repeats it; the error that ends it has it, so that callers can."""
-        if isinstance(photos, kind):
-            lift = photos
-        else:
-            lift = yield from self._lift(kind, cast("Photos", photos), face)
+    async def _load(self) -> Lifter:
+        for _ in range(3):
+            contract = await self.contract()
+            generator = await self.generator()
+            # The contract may have changed between the two answers, or between two workers.
+            if generator.source_id == contract.binding.get("decoy_source_id"):
+                return await self._channel.run(Lifter.load, self._pack, contract, generator)
+        raise UnexpectedAnswer("the generator of the service is not that of its contract")
+
+    @contextmanager
+    def _sending(self, lift: results.Lift) -> Iterator[None]:
+        """Put a lift into the error that ends its sending, so that callers can repeat it."""
         try:
-            return (yield from send({"template": base64.b64encode(lift.template).decode("ascii")}))
+            yield
         except ContractMismatch:
             # Not lifted again here: a service that only claims to have changed would get two lifts.
-            self._is_current = False
+            self._lifter = None
             raise
         except VeilfaceError as error:
             error.lift = lift
@@ -414,17 +421,6 @@ class PrivateFlows(Flows):
                 "with the photo. Two lifts of one photo give the embedding away."
             )
             raise
-
-    def _fetch(self) -> Flow[LiftInputs]:
-        for _ in range(3):
-            contract = yield from self.contract()
-            generator = yield from self.generator()
-            # The contract may have changed between the two answers, or between two workers.
-            if generator.source_id == contract.binding.get("decoy_source_id"):
-                inputs: LiftInputs = yield partial(self._lifter.keep, contract, generator)
-                self._is_current = True
-                return inputs
-        raise UnexpectedAnswer("the generator of the service is not that of its contract")
 
 
 def _connection_failed(error: httpx.RequestError) -> ConnectionFailed:
@@ -462,9 +458,8 @@ def _encoded(holder_key: bytes | None) -> str | None:
     return base64.urlsafe_b64encode(holder_key).decode("ascii").rstrip("=")
 
 
-def _files(field: str, photos: Photos) -> list[tuple[str, tuple[str, bytes, str]]]:
-    # A file name of the user's machine is nobody else's business.
-    return [(field, ("photo", photo, "application/octet-stream")) for photo in read_photos(photos)]
+def _template(lift: results.Lift) -> dict[str, str]:
+    return {"template": base64.b64encode(lift.template).decode("ascii")}
 
 
 def _present(**values: Any) -> dict[str, Any]:
