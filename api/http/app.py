@@ -8,7 +8,7 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
 from functools import cache, partial
 from importlib.metadata import version
-from typing import Any
+from typing import Any, NoReturn
 
 import anyio
 import anyio.to_thread
@@ -18,16 +18,13 @@ from fastapi.routing import iter_route_contexts
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.middleware.cors import CORSMiddleware
-from starlette.responses import Response
 from starlette.routing import BaseRoute
 from starlette.types import Receive, Scope, Send
 
-from api.http.answers import error_answer
-from api.http.audit import note_refusal
 from api.http.context import RequestContext
 from api.http.deps import refuse_unknown
-from api.http.errors import ApiError, StartError, api_error, wrong_value
-from api.http.openapi import ERRORS, allowed_methods, describe, operation_id
+from api.http.errors import StartError
+from api.http.openapi import ERRORS, describe, operation_id
 from api.http.routes import (
     audit_log,
     challenges,
@@ -49,15 +46,13 @@ from api.limits.rates import RateLimits
 from api.service.allocator import give_back
 from api.service.housekeeping import purge_regularly
 from api.service.logging import configure, log
-from api.service.metrics import count_lockout, forget_dead_workers, set_build
+from api.service.metrics import BUILD, forget_dead_workers
 from api.service.opening import require_privacy, retention_of
 from api.service.readiness import Readiness
 from api.service.runtime import Runtime
 from api.settings import Settings
-from models.errors import ModelError
 from templates.contract.nobody import Nobody
 from templates.distances.blas import single_threaded
-from templates.errors import VeilfaceError
 
 VERSION = version("veilface")
 API = (
@@ -189,10 +184,8 @@ def _add_middleware(app: FastAPI, settings: Settings) -> None:
             allow_headers=CORS_REQUEST_HEADERS,
             expose_headers=CORS_ANSWER_HEADERS,
         )
-    for kind in (ApiError, VeilfaceError, ModelError):
-        app.add_exception_handler(kind, _known_error)
-    app.add_exception_handler(HTTPException, _framework_error)
-    app.add_exception_handler(RequestValidationError, _validation_error)
+    for kind in (HTTPException, RequestValidationError):
+        app.add_exception_handler(kind, _pass_on)
 
 
 async def _open(
@@ -214,7 +207,7 @@ async def _open(
     app.state.rate_limits, app.state.runtime = rate_limits, runtime
     app.state.gate, app.state.readiness = gate, readiness
     forget_dead_workers()
-    set_build(version=VERSION, contract_id=runtime.contract.contract_id)
+    BUILD.labels(VERSION, runtime.contract.contract_id).set(1)
     log(
         "started",
         version=VERSION,
@@ -254,35 +247,6 @@ async def _close(runtime: Runtime) -> None:
     log("stopped", pid=os.getpid())
 
 
-async def _known_error(request: Request, error: Exception) -> Response:
-    known = api_error(error)
-    if known is None:
-        raise error
-    request.app.state.readiness.note(error)
-    if known.code == "locked_out":
-        count_lockout(disabled=bool(known.details.get("disabled")))
-    request.state.log["code"] = known.code
-    request.state.log["error_type"] = None if error is known else type(error).__name__
-    await note_refusal(request, known, error)
-    return error_answer(known, request.state.request_id)
-
-
-async def _framework_error(request: Request, error: Exception) -> Response:
-    assert isinstance(error, HTTPException)  # noqa: S101 - registered for this type
-    code, message = {
-        404: ("not_found", "there is no such path"),
-        405: ("method_not_allowed", "this path does not take this method"),
-        413: ("request_too_large", "the request body is too large"),
-    }.get(error.status_code, ("malformed_request", "the request cannot be understood"))
-    headers = dict(error.headers or {})
-    if code == "method_not_allowed":
-        # The page's paths are not in the document; for them the framework knows.
-        path = request.scope["path"].removeprefix(request.scope["root_path"])
-        allowed = allowed_methods(request.app.openapi(), path)
-        headers["Allow"] = ", ".join(allowed) or headers.get("Allow", "")
-    return await _known_error(request, ApiError(code, message, {}, headers))
-
-
-async def _validation_error(request: Request, error: Exception) -> Response:
-    assert isinstance(error, RequestValidationError)  # noqa: S101 - registered for this type
-    return await _known_error(request, wrong_value(error.errors()[0]))
+async def _pass_on(_: Request, error: Exception) -> NoReturn:
+    """Leave an exception of the framework to :class:`RequestContext`, as all others are."""
+    raise error

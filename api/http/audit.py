@@ -7,11 +7,13 @@ answer.
 
 import contextlib
 import getpass
+import logging
 
 from starlette.requests import Request
 
 from api.http.errors import ApiError
-from templates.errors import StoreError
+from api.http.schemas import REQUEST_ID
+from api.service.logging import log
 from templates.store.audit_log import By, Entry
 
 ACTIONS = {
@@ -29,11 +31,6 @@ UNWRITTEN = frozenset(
     {"rate_limited", "overloaded", "store_unavailable", "model_unavailable", "internal_error"}
 )
 """Codes that say nothing of the caller: the service's own state. Metrics and the log count them."""
-
-
-def by(request: Request) -> By:
-    """Name the API key and the request."""
-    return By(f"key:{request.state.log['key_id']}", request.state.request_id)
 
 
 def operator() -> By:
@@ -57,10 +54,13 @@ async def note_refusal(request: Request, error: ApiError, cause: Exception) -> N
     entry = Entry(
         ACTIONS.get(route, route.replace("_", "-")),
         error.code,
-        by(request),
+        By(f"key:{fields['key_id']}", REQUEST_ID.get()),
         tenant=fields.get("tenant"),
         pseudonym=getattr(request.state, "pseudonym", None),
     )
-    log = request.app.state.runtime.store.audit_log
-    with contextlib.suppress(StoreError, ApiError):
-        await request.app.state.gate.query(lambda: log.record(entry))
+    audit_log = request.app.state.runtime.store.audit_log
+    try:
+        await request.app.state.gate.query(lambda: audit_log.record(entry))
+    except Exception as failure:
+        kind = type(failure).__name__
+        log("refusal not recorded", severity=logging.ERROR, code=error.code, error_type=kind)

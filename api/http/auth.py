@@ -8,9 +8,8 @@ from typing import Annotated, Any, TypeVar
 from fastapi import Depends, Request, Security
 from fastapi.security import APIKeyHeader, HTTPAuthorizationCredentials, HTTPBearer
 
-from api.http.answers import common
-from api.http.audit import by
 from api.http.errors import ApiError
+from api.http.schemas import REQUEST_ID
 from api.http.tokens import SubjectToken, opened_token, prefix_of
 from api.limits.admission import Gate
 from api.limits.rates import RateLimits
@@ -78,12 +77,7 @@ class Call:
     @property
     def by(self) -> By:
         """Who asks, for the audit log."""
-        return by(self.request)
-
-    @property
-    def common(self) -> dict[str, Any]:
-        """What every answer says."""
-        return common(self.request)
+        return By(f"key:{self.key.prefix}", REQUEST_ID.get())
 
     def require(self, *rights: str) -> None:
         """Refuse unless the caller has one of these rights."""

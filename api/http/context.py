@@ -8,14 +8,15 @@ from typing import Any
 
 import anyio
 from starlette.datastructures import Headers, MutableHeaders
-from starlette.requests import ClientDisconnect
+from starlette.requests import ClientDisconnect, Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from api.http.answers import error_answer
-from api.http.errors import ERROR_CODES, ApiError
+from api.http.audit import note_refusal
+from api.http.errors import ERROR_CODES, ApiError, api_error, error_answer
+from api.http.schemas import REQUEST_ID
 from api.limits.rates import RateLimits
 from api.service.logging import log
-from api.service.metrics import IN_FLIGHT, count_error, count_request
+from api.service.metrics import ERRORS, IN_FLIGHT, LOCKED_OUT, count_request
 from models.demo import DEMO_NOTICE
 
 SANE_REQUEST_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{7,63}")
@@ -33,10 +34,10 @@ HEALTH_PATHS = frozenset({"/health/live", "/health/ready"})
 
 
 class RequestContext:
-    """ASGI middleware; it sits outside of all exception handlers.
+    """ASGI middleware: the one place where an exception becomes an answer.
 
-    ``scope["state"]`` gets ``request_id`` and ``log``, fields of the request's log line that routes
-    may add to. `root_path` is the path under which a proxy shows the service.
+    ``scope["state"]`` gets ``log``, fields of the request's log line that routes may add to.
+    `root_path` is the path under which a proxy shows the service.
     """
 
     def __init__(
@@ -52,17 +53,15 @@ class RequestContext:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one request."""
-        if scope["type"] == "lifespan":
-            await self._start_and_stop(scope, receive, send)
-            return
         if scope["type"] != "http":
-            await self._app(scope, receive, send)
+            await self._start_and_stop(scope, receive, send)
             return
         request_id = Headers(scope=scope).get("x-request-id", "")
         if not SANE_REQUEST_ID.fullmatch(request_id):
             request_id = secrets.token_hex(16)
+        REQUEST_ID.set(request_id)
         fields: dict[str, Any] = {}
-        scope.setdefault("state", {}).update(request_id=request_id, log=fields)
+        scope.setdefault("state", {})["log"] = fields
         scope["root_path"] = self._root_path
         started, status = time.perf_counter(), 0
 
@@ -80,31 +79,22 @@ class RequestContext:
                 return
             raise ClientDisconnect
 
-        async def refuse(refusal: ApiError) -> None:
-            fields["code"] = refusal.code
-            await error_answer(refusal, request_id)(scope, receive, send_with_headers)
-
         IN_FLIGHT.inc()
         try:
             await _require_few_requests(scope)
             await self._app(scope, receive, send_with_headers)
-        except ApiError as refusal:
-            await refuse(refusal)
         except ClientDisconnect:
             fields["code"] = "client_disconnected"
         except Exception as error:
-            # The exception's text may hold anything; its type is all that leaves this place.
-            fields["error_type"], fields["code"] = type(error).__name__, "internal_error"
+            refusal = await _refusal(Request(scope), error)
             if status == 0:
-                await refuse(
-                    ApiError("internal_error", "the service failed; report the request id")
-                )
+                await error_answer(refusal, request_id)(scope, receive, send_with_headers)
         finally:
             IN_FLIGHT.dec()
             route, code = getattr(scope.get("route"), "path", None), fields.get("code")
             seconds = time.perf_counter() - started
             if code in ERROR_CODES:
-                count_error(code)
+                ERRORS.labels(code).inc()
             count_request(route=route, method=scope["method"], status=status, seconds=seconds)
             log(
                 "request",
@@ -131,6 +121,21 @@ class RequestContext:
         except Exception as error:
             log("worker failed", severity=logging.ERROR, error_type=type(error).__name__)
             raise
+
+
+async def _refusal(request: Request, error: Exception) -> ApiError:
+    """Return what an exception is answered with, after everybody was told who must know of it."""
+    refusal = api_error(error)
+    fields = request.state.log
+    fields["code"] = refusal.code
+    if error is not refusal:
+        # The exception's text may hold anything; its type is all that leaves this place.
+        fields["error_type"] = type(error).__name__
+    if refusal.code == "locked_out":
+        LOCKED_OUT.labels("disabled" if refusal.details["disabled"] else "locked").inc()
+    request.app.state.readiness.note(error)
+    await note_refusal(request, refusal, error)
+    return refusal
 
 
 async def _require_few_requests(scope: Scope) -> None:

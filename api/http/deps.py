@@ -100,6 +100,12 @@ def _precondition_refused(message: str) -> ApiError:
     return ApiError("validation_failed", f"{field}: {message}", {"field": field})
 
 
+def has_copy(request: Request, etag: str) -> bool:
+    """Whether `If-None-Match` says that the client has what this `ETag` names."""
+    tags = request.headers.get("if-none-match", "").split(",")
+    return bool({tag.strip().removeprefix("W/") for tag in tags} & {etag, "*"})
+
+
 def etag(template_id: str) -> str:
     """Return the entity tag of an enrollment."""
     return f'"{template_id}"'

@@ -11,7 +11,10 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
+from fastapi.exceptions import RequestValidationError
 from pydantic_core import to_json
+from starlette.exceptions import HTTPException
+from starlette.responses import JSONResponse
 
 from models.errors import FaceError, ImageError, ModelError, PhotoRejected
 from templates.errors import (
@@ -129,18 +132,29 @@ DISABLED_RETRY_AFTER_S = 86_400
 """What a client is told of a subject that waits for an operator: to ask again in a day."""
 
 
-def api_error(error: Exception) -> ApiError | None:
-    """Give an exception of the packages below its code; None for one that is not expected.
+def error_answer(error: ApiError, request_id: str) -> JSONResponse:
+    """Return an error in the one shape."""
+    body = {"code": error.code, "message": error.message, "details": dict(error.details)}
+    return JSONResponse(
+        {"error": body, "request_id": request_id}, error.status, headers=dict(error.headers)
+    )
+
+
+def api_error(error: Exception) -> ApiError:
+    """Give an exception its code: ``internal_error`` for one that nobody expects.
 
     The text of a client's mistake is passed on: it holds no number of an embedding or template, and
     no key. The text of a failure of the service is not, because it may name a file or a host.
     """
     if isinstance(error, ApiError):
         return error
+    if isinstance(error, RequestValidationError):
+        return wrong_value(error.errors()[0])
+    if isinstance(error, HTTPException):
+        code, message = _FRAMEWORK.get(error.status_code, _FRAMEWORK[400])
+        return ApiError(code, message, {}, error.headers or {})
     if isinstance(error, PhotoRejected):
         known = api_error(error.cause)
-        if known is None:
-            return None
         details = {"image": error.index, **known.details}
         return ApiError(known.code, error.placed(known.message), details, known.headers)
     if isinstance(error, InconsistentImages):
@@ -156,7 +170,7 @@ def api_error(error: Exception) -> ApiError | None:
         if isinstance(error, kind):
             wait = {"Retry-After": "5"} if ERROR_CODES[code].status == 503 else {}
             return ApiError(code, public or str(error), {}, wait)
-    return None
+    return ApiError("internal_error", "the service failed; report the request id")
 
 
 def _locked_out(error: LockedOut) -> ApiError:
@@ -165,6 +179,12 @@ def _locked_out(error: LockedOut) -> ApiError:
     return ApiError("locked_out", str(error), {"disabled": disabled}, {"Retry-After": str(wait)})
 
 
+_FRAMEWORK = {
+    400: ("malformed_request", "the request cannot be understood"),
+    404: ("not_found", "there is no such path"),
+    405: ("method_not_allowed", "this path does not take this method"),
+    413: ("request_too_large", "the request body is too large"),
+}
 _TABLE: tuple[tuple[type[Exception], str, str | None], ...] = (
     (ModelError, "model_unavailable", "the model failed on this request"),
     (InvalidTemplate, "invalid_template", None),

@@ -1,7 +1,6 @@
 """What OpenAPI says of calls, errors and request bodies, which FastAPI cannot say by itself."""
 
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from fastapi.openapi.utils import get_openapi
@@ -62,16 +61,3 @@ def _schema_of(model: type[BaseModel]) -> dict[str, Any]:
         name = member.pop("$ref", "").removeprefix("#/$defs/")
         member.update({**definitions.get(name, {}), **member})
     return schema
-
-
-def allowed_methods(document: Mapping[str, Any], path: str) -> list[str]:
-    """Return the methods of a path, by the document; the framework names one route's only."""
-    # Where two paths fit, the one that is written out is meant: `/v1/subjects/import`.
-    fitting = [
-        template
-        for template in document["paths"]
-        if re.fullmatch(re.sub(r"\{[^}]*\}", "[^/]+", template), path)
-    ]
-    for template in sorted(fitting, key=lambda template: template.count("{")):
-        return sorted(method.upper() for method in document["paths"][template])
-    return []

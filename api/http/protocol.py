@@ -9,9 +9,8 @@ import secrets
 
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
-from api.http.answers import error_answer
-from api.http.errors import ApiError
-from api.service.metrics import count_error
+from api.http.errors import ApiError, error_answer
+from api.service.metrics import ERRORS
 
 MAX_FRAMING_BYTES = 16 * 1024
 """Bytes of a request that are not its body: request line, headers, sizes of chunks, trailers."""
@@ -74,7 +73,7 @@ class Protocol(HttpToolsProtocol):
             cycle.message_event.set()
         if not answering:
             refusal = ApiError("malformed_request", msg.removesuffix(" received."))
-            count_error(refusal.code)
+            ERRORS.labels(refusal.code).inc()
             request_id = secrets.token_hex(16)
             answer = error_answer(refusal, request_id)
             headers = {**answer.headers, "x-request-id": request_id, "connection": "close"}

@@ -1,5 +1,6 @@
 """What the calls answer: FastAPI writes these models as JSON, and OpenAPI describes them."""
 
+from contextvars import ContextVar
 from datetime import UTC, datetime
 from typing import Annotated, Any, Literal
 
@@ -10,8 +11,9 @@ from templates.store.api_keys import Right
 from verify import Movement
 from verify.challenge import LivenessFailure
 
+REQUEST_ID: ContextVar[str] = ContextVar("request_id")
+"""Id of the request that is being answered, which the middleware sets."""
 HEX = "9f86d081884c7d659a2feaa0c55ad015a3bf4f1b2b0b822cd15d6c15b0f00a08"
-REQUEST_ID = "4b1f0d5c8f1e4c54a52b3c9f7e2d6a10"
 
 
 def iso_time(value: datetime) -> str:
@@ -32,14 +34,15 @@ Time = Annotated[
 
 
 class _Shape(BaseModel):
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", json_schema_serialization_defaults_required=True)
 
 
 class _Answer(_Shape):
     """What every answer has."""
 
-    request_id: str = Field(description="Also in X-Request-ID.", examples=[REQUEST_ID])
-    notice: str | None = Field(None, description="Only with the demo model.", exclude_if=_is_none)
+    request_id: str = Field(
+        default_factory=lambda: REQUEST_ID.get(), description="Also in X-Request-ID."
+    )
 
 
 class ErrorBody(_Shape):
@@ -54,7 +57,7 @@ class ErrorAnswer(_Shape):
     """The one shape of all errors."""
 
     error: ErrorBody
-    request_id: str = Field(examples=[REQUEST_ID])
+    request_id: str
 
 
 class Photo(_Shape):

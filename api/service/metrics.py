@@ -153,21 +153,6 @@ def count_request(*, route: str | None, method: str, status: int, seconds: float
     REQUEST_SECONDS.labels(named).observe(seconds)
 
 
-def count_error(code: str) -> None:
-    """Count one answer with an error code."""
-    ERRORS.labels(code).inc()
-
-
-def count_lockout(*, disabled: bool) -> None:
-    """Count one verification that was refused because of its subject's failed attempts."""
-    LOCKED_OUT.labels("disabled" if disabled else "locked").inc()
-
-
-def set_build(*, version: str, contract_id: str) -> None:
-    """Say what runs."""
-    BUILD.labels(version, contract_id).set(1)
-
-
 def exposition() -> bytes:
     """Write all metrics, of all workers, in Prometheus' text format 0.0.4."""
     if DIRECTORY_VARIABLE not in os.environ:

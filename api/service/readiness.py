@@ -41,13 +41,11 @@ class Readiness:
 
     def note(self, error: Exception) -> None:
         """Take note of an error that some work ended with, if it says that store or model fail."""
-        known = api_error(error)
-        if isinstance(error, ApiError) or known is None:
-            return
+        code = api_error(error).code
         passing = isinstance(error, StoreBusy | RetiredRotation)
-        if known.code == "store_unavailable" and isinstance(error, StoreError) and not passing:
+        if code == "store_unavailable" and isinstance(error, StoreError) and not passing:
             self._fail("store", error)
-        elif known.code == "model_unavailable":
+        elif code == "model_unavailable" and not isinstance(error, ApiError):
             self._fail("model", error)
 
     async def check(self) -> None:

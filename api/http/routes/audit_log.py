@@ -40,7 +40,6 @@ async def get_audit_log(
             call.tenant, limit=limit, before=before, pseudonym=pseudonym
         )
         return AuditLogAnswer(
-            **call.common,
             # Without its number, which would tell how much the other tenants do.
             lines=[
                 AuditLine(

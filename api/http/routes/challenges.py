@@ -69,7 +69,6 @@ async def create_challenge(call: Verifies) -> ChallengeAnswer:
         is_of_token=call.token is not None,
     )
     return ChallengeAnswer(
-        **call.common,
         challenge_id=challenge.sealed(call.runtime.keyring, _PURPOSE, [call.tenant]),
         movements=list(challenge.movements),
         min_frames=MIN_FRAMES,

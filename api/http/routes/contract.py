@@ -4,8 +4,8 @@ from typing import Any
 
 from fastapi import APIRouter, Response
 
-from api.http.answers import has_copy
 from api.http.auth import AnyCall, Lifts
+from api.http.deps import has_copy
 from api.http.errors import ApiError
 from api.http.receipts import receipt_key_json
 from api.http.schemas import ContractAnswer, KeyAnswer, ReceiptKey
@@ -19,7 +19,6 @@ router = APIRouter(prefix="/v1", tags=["Operations"])
 async def get_own_key(call: AnyCall) -> KeyAnswer:
     """Right: any. A key is told of itself only, and never its secret nor its label."""
     return KeyAnswer(
-        **call.common,
         prefix=call.key.prefix,
         tenant=call.tenant,
         rights=[right for right in Right if right in call.key.rights],
@@ -37,7 +36,6 @@ async def get_contract(call: AnyCall) -> ContractAnswer:
     tenant = await call.query(lambda: call.store.tenants.get(call.tenant))
     public: dict[str, Any] = runtime.contract.public()
     return ContractAnswer(
-        **call.common,
         **public,
         photos=runtime.pack is not None,
         generator=isinstance(runtime.source, DecoyGenerator),

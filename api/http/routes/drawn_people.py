@@ -3,10 +3,9 @@
 import functools
 
 from starlette.requests import Request
-from starlette.responses import Response
+from starlette.responses import JSONResponse, Response
 from starlette.routing import BaseRoute
 
-from api.http.answers import JsonAnswer, common
 from api.http.errors import ApiError
 from api.http.routes.page import HEADERS, route_of
 from api.limits.rates import address_of
@@ -30,9 +29,9 @@ def drawn_people_routes() -> list[BaseRoute]:
     ]
 
 
-async def list_people(request: Request) -> Response:
+async def list_people(_: Request) -> Response:
     """List them, those who are enrolled first."""
-    return JsonAnswer({**common(request), "people": list(_PEOPLE), "shots": SHOTS})
+    return JSONResponse({"people": list(_PEOPLE), "shots": SHOTS})
 
 
 async def draw_photo(request: Request) -> Response:

@@ -92,7 +92,6 @@ async def enroll(
                 by=call.by,
             )
             return EnrollmentAnswer(
-                **call.common,
                 template_id=stored.template_id,
                 contract_id=enrollment.contract_id,
                 replaced=not stored.created,

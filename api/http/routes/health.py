@@ -5,7 +5,6 @@ from fastapi import APIRouter, Depends, Request
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
 from starlette.responses import Response
 
-from api.http.answers import common
 from api.http.auth import BearerDep, HeaderDep, call_of
 from api.http.schemas import HealthAnswer
 from api.service.metrics import exposition
@@ -16,9 +15,9 @@ router = APIRouter(tags=["Operations"])
 
 @router.head("/health/live", include_in_schema=False)
 @router.get("/health/live", summary="The process answers")
-async def live(request: Request) -> HealthAnswer:
+async def live() -> HealthAnswer:
     """Right: none. Ask nothing but the process itself."""
-    return HealthAnswer(**common(request), status="ok")
+    return HealthAnswer(status="ok")
 
 
 @router.head("/health/ready", include_in_schema=False)
@@ -27,7 +26,7 @@ async def ready(request: Request) -> HealthAnswer:
     """Right: none. After a failed write the database must take one, a failed model infer once."""
     readiness: Readiness = request.app.state.readiness
     await readiness.check()
-    return HealthAnswer(**common(request), status="ok")
+    return HealthAnswer(status="ok")
 
 
 async def may_read_metrics(

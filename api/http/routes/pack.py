@@ -6,8 +6,8 @@ from fastapi import APIRouter, Depends, Path
 from starlette.responses import FileResponse, Response
 from starlette.types import Receive, Scope, Send
 
-from api.http.answers import has_copy
 from api.http.auth import AnyCall
+from api.http.deps import has_copy
 from api.http.errors import ApiError
 from api.http.schemas import PackAnswer, PackFileEntry
 from api.http.tokens import SubjectToken
@@ -47,7 +47,6 @@ async def list_pack(call: AnyCall) -> PackAnswer:
     if pack is None or not graphs:
         raise _not_served()
     return PackAnswer(
-        **call.common,
         name=pack.info.name,
         licence=licence_of(pack),
         contract_id=call.runtime.contract.contract_id,

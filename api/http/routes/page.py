@@ -14,8 +14,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import BaseRoute, Route
 
-from api.http.answers import has_copy
-from api.http.deps import refuse_body, refuse_unknown
+from api.http.deps import has_copy, refuse_body, refuse_unknown
 from api.http.errors import ApiError
 
 WEB = Path(__file__).resolve().parents[2] / "web"

@@ -46,7 +46,6 @@ async def check_photo(call: EnrollsOrVerifies) -> PhotoCheckAnswer:
             except FaceError as refusal:
                 code: Any = refusal.code
                 return PhotoCheckAnswer(
-                    **call.common,
                     usable=False,
                     code=code,
                     message=str(refusal),
@@ -58,7 +57,6 @@ async def check_photo(call: EnrollsOrVerifies) -> PhotoCheckAnswer:
             if taken.face is None:
                 message = "an aligned crop of a face, clear enough"
             return PhotoCheckAnswer(
-                **call.common,
                 usable=True,
                 code=None,
                 message=message,

@@ -37,7 +37,6 @@ async def list_subjects(
     )
     binding = call.runtime.contract.binding
     return SubjectsAnswer(
-        **call.common,
         subjects=[Subject(**_described(record, binding)) for record in page.records],
         next_cursor=page.next_cursor,
     )
@@ -50,7 +49,7 @@ async def get_subject(call: Enrolls, subject: SubjectDep, response: Response) ->
     if record is None:
         raise ApiError("not_enrolled", "nobody is enrolled under this id")
     response.headers["ETag"] = etag(record.template_id)
-    return SubjectAnswer(**call.common, **_described(record, call.runtime.contract.binding))
+    return SubjectAnswer(**_described(record, call.runtime.contract.binding))
 
 
 @router.delete("/{subject_id}", summary="Erase a subject")
@@ -75,9 +74,7 @@ async def erase_subject(
             raise ApiError("not_enrolled", "nobody was ever enrolled under this id")
         erasure = store.erasures.erase(tenant, subject, by=call.by)
         call.request.state.log["log_purged"] = erasure.log_purged
-        return ReceiptAnswer(
-            **call.common, **receipt_json(erasure.receipt), log_purged=erasure.log_purged
-        )
+        return ReceiptAnswer(**receipt_json(erasure.receipt), log_purged=erasure.log_purged)
 
     return await call.query(work)
 
@@ -92,7 +89,6 @@ async def get_lockout(call: Administers, subject: SubjectDep) -> LockoutAnswer:
     if status is None or (status.consecutive == 0 and status.disabled_at is None):
         raise ApiError("not_found", "this subject has no failed attempts")
     return LockoutAnswer(
-        **call.common,
         consecutive_failures=status.consecutive,
         last_failed_at=status.last_failed_at,
         locked_until=status.locked_until,
@@ -107,7 +103,7 @@ async def unlock_subject(call: Administers, subject: SubjectDep) -> UnlockAnswer
     Make sure first that it was the subject who failed: after this, an attacker may try again too.
     """
     lifted = await call.query(lambda: call.store.attempts.reset(call.tenant, subject, by=call.by))
-    return UnlockAnswer(**call.common, lifted=lifted)
+    return UnlockAnswer(lifted=lifted)
 
 
 def _described(record: SubjectRecord, binding: Binding) -> dict[str, Any]:

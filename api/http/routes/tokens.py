@@ -55,7 +55,6 @@ async def create_token(call: AnyCall) -> TokenAnswer:
     call.request.state.log["token_id"] = token.token_id
     TOKENS.labels(token.action).inc()
     return TokenAnswer(
-        **call.common,
         token=text,
         token_id=token.token_id,
         subject_id=token.subject,
@@ -88,11 +87,10 @@ async def get_token_outcome(
     line = await call.query(lambda: call.store.audit_log.use_of(digest))
     if line is None or line.pseudonym != call.note_subject(subject):
         return TokenOutcomeAnswer(
-            **call.common, token_id=token_id, used=False, outcome=None, level=None, used_at=None
+            token_id=token_id, used=False, outcome=None, level=None, used_at=None
         )
     outcome: Any = line.outcome
     return TokenOutcomeAnswer(
-        **call.common,
         token_id=token_id,
         used=True,
         outcome=outcome,

@@ -32,7 +32,6 @@ async def export_subject(call: Exports, subject: SubjectDep) -> ExportAnswer:
             raise ApiError("not_enrolled", "nobody is enrolled under this id")
         raise ApiError("not_found", "there is nothing to export")
     return ExportAnswer(
-        **call.common,
         export=base64.b64encode(exported).decode("ascii"),
         contract_id=runtime.contract.contract_id,
         key_id=runtime.export_key.key_id,
@@ -94,7 +93,6 @@ async def import_subject(
                 by=call.by,
             )
             return ImportAnswer(
-                **call.common,
                 subject_id=exported.subject_id,
                 template_id=stored.template_id,
                 contract_id=enrollment.contract_id,

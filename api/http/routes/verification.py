@@ -100,7 +100,6 @@ async def verify(call: Verifies, subject: SubjectDep) -> VerifyAnswer:
 def answer_of(call: Call, decision: Decision, *, probe: str) -> VerifyAnswer:
     """Return the answer, with what the caller may see; note it for the log and the metrics."""
     answer = VerifyAnswer(
-        **call.common,
         decision="accept" if decision.accepted else "reject",
         reason=decision.reason,
         liveness=decision.liveness,

@@ -5,7 +5,7 @@ import type { components } from "./openapi.js";
 type Schemas = components["schemas"];
 
 /** What every answer has. */
-export type Answer = Pick<Schemas["HealthAnswer"], "request_id" | "notice">;
+export type Answer = Pick<Schemas["HealthAnswer"], "request_id">;
 /** The subject is enrolled; `images` is empty for a template. */
 export type Enrollment = Schemas["EnrollmentAnswer"];
 /** Movements to make, in their order, as the person who makes them sees them. */

@@ -60,7 +60,6 @@ class Answer(Value):
     """What every answer has."""
 
     request_id: str
-    notice: str | None = None
 
 
 class PhotoUsed(Value):

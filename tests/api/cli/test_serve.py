@@ -62,7 +62,7 @@ def test_it_serves_prints_no_key_and_ends_by_sigterm(world, data, tmp_path):
             f"{url}/v1/contract", headers={"Authorization": f"Bearer {token}"}, timeout=PATIENCE_S
         )
         assert answer.status_code == 200
-        assert answer.json()["notice"] == DEMO_NOTICE
+        assert answer.headers["x-veilface-notice"] == DEMO_NOTICE
         assert httpx.get(f"{url}/v1/contract", timeout=PATIENCE_S).status_code == 401
         process.send_signal(signal.SIGTERM)
         assert process.wait(timeout=PATIENCE_S) in (0, -signal.SIGTERM)

@@ -1,5 +1,4 @@
 import hashlib
-import json
 from pathlib import Path
 
 import numpy as np
@@ -80,7 +79,4 @@ def test_the_demo_says_so_in_every_answer(tmp_path: Path) -> None:
     notice = "demo model: not for authentication"
     with Client(create_app(deployment.settings), headers=bearer(deployment.token)) as client:
         for path in ("/health/live", "/v1/contract", "/v1/contract/generator", "/nowhere"):
-            answer = client.get(path)
-            assert answer.headers["x-veilface-notice"] == notice
-            if answer.headers["content-type"] == "application/json":
-                assert json.loads(answer.text).get("notice") == notice or answer.status_code == 404
+            assert client.get(path).headers["x-veilface-notice"] == notice
