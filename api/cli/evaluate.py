@@ -18,7 +18,7 @@ from api.cli.evaluation_inputs import (
 )
 from api.cli.evaluation_report import write_results
 from api.cli.inputs import listed, named_file
-from api.cli.options import PROCESSOR, Device, chosen_device, quick
+from api.cli.options import quick
 from api.cli.results import Plan, Result, Table, reports
 from api.settings import Settings
 from templates.distances import Metric
@@ -134,7 +134,6 @@ def evaluate(
         int | None,
         typer.Option(min=1, help="Threads here. Unset: one a processor, 8 at most."),
     ] = None,
-    device: Device = PROCESSOR,
     _quick: Annotated[bool, quick(dim="4,16", metric="spherical", repeats=1)] = False,
     _plan: Plan = None,
 ) -> Result:
@@ -151,7 +150,6 @@ def evaluate(
     from verify.evaluation.figures import det_figure, verification_figure
     from verify.evaluation.results import document
 
-    torch_device = chosen_device(device, here=cluster is None)
     sets = open_all(datasets, pictures=embeddings is None)
     names = None
     if strategy is not None:
@@ -169,7 +167,6 @@ def evaluate(
             shared_decoys=shared_decoys,
             repeats=repeats,
             seed=seed,
-            device=torch_device,
             targets=tuple(sorted(_rates(fmr), reverse=True)),
         )
         units_of(plan, decoy_sources, n=embedder.model.n)

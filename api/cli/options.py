@@ -61,12 +61,10 @@ def quick(**smaller: Any) -> Any:
     )
 
 
-def chosen_device(device: str, *, here: bool = True) -> str | None:
-    """Check that this machine, unless not ``here``, has a device; None for the processor."""
+def chosen_device(device: str) -> str | None:
+    """Check that this machine has a device; None for the processor."""
     if device == PROCESSOR:
         return None
-    if not here:
-        return device
     # Imported here: a command without the flag starts sooner.
     from templates.distances import require_device
 

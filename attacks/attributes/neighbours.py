@@ -47,10 +47,7 @@ def nearest_neighbours(
     if not 1 <= k <= len(gallery):
         raise AuditError(f"{k} neighbours cannot be found among {len(gallery)} faces")
     if isinstance(attacked, SubspaceBatch):
-        return {
-            metric: nearest(gallery, attacked, k=k, metric=metric, of_templates=True)
-            for metric in metrics
-        }
+        return {metric: nearest(gallery, attacked, k=k, metric=metric) for metric in metrics}
     # Imported here: only an audit of attributes needs the library.
     from sklearn.neighbors import NearestNeighbors
 

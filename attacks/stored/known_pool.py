@@ -45,12 +45,12 @@ def find_decoys(
     own : (P,) int64, optional
         Entry that is the face itself, where the attacker lifted entries of its own pool.
     """
-    labels = None if own is None else (np.arange(len(pool), dtype=np.int64), own)
-    near = nearest(
-        pool, templates, k=min(most, len(pool) - (own is not None)), metric=Metric.EUCLIDEAN,
-        of_templates=True, labels=labels,
-    )  # fmt: skip
-    return Decoys(near.indices, near.distances < TOUCH)
+    count = min(most + (own is not None), len(pool))
+    entries, distances = nearest(pool, templates, k=count, metric=Metric.EUCLIDEAN)
+    inside = distances < TOUCH
+    if own is not None:
+        inside &= entries != own[:, None]
+    return Decoys(entries, inside)
 
 
 def strip(

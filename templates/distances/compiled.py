@@ -62,12 +62,11 @@ def _compiled(function: _Function) -> _Function:
 
 
 def tiles(
-    probes: Probes, templates: SubspaceBatch, *, metric: Metric, steps: int, threads: int | None
+    probes: Probes, templates: SubspaceBatch, *, metric: Metric, steps: int
 ) -> Iterator[Tile]:
     """Yield rows, columns and distances (R, C) float32 of all parts of the matrix, in order."""
     probes, terms = _prepared(probes, metric is Metric.SPHERICAL)
-    with single_threaded() as available:
-        count = threads or available
+    with single_threaded() as count:
         most = max(1, _TEMPLATE_ROWS // (templates.m + 1))
         # As many parts as threads, or a multiple of it, in whole vectors.
         width = -(-len(templates) // (count * max(1, -(-len(templates) // (count * most)))))

@@ -1,4 +1,4 @@
-"""What every part of the package speaks of: metrics, steps, neighbours, labels."""
+"""What every part of the package speaks of: metrics, steps, neighbours."""
 
 from enum import StrEnum
 from typing import Any, NamedTuple, TypeVar
@@ -29,9 +29,6 @@ Indices = NDArray[np.int64]
 Probes = Array32 | NDArray[np.float64] | SubspaceBatch
 Tile = tuple[slice, slice, Floats]
 """Probes and templates of a part of the matrix, and their distances (R, C)."""
-
-Labels = tuple[Indices, Indices]
-"""One label for each probe and each template; pairs with equal labels do not count."""
 
 
 class Metric(StrEnum):

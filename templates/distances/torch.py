@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from templates.distances import exact
@@ -79,23 +78,6 @@ def tiles(
                 sides = probes[rows], templates[columns]
                 out[i, j] = exact.pairs(*sides, i, j, metric=metric, steps=steps)
             yield rows, columns, out
-
-
-def paired(
-    probes: SubspaceBatch, templates: SubspaceBatch, *, metric: Metric, steps: int, device: str
-) -> NDArray[np.float32]:
-    """Distances of lifted probe i to template i, (P,)."""
-    there, out = usable(device), np.empty(len(probes), dtype=np.float32)
-    numbers = (probes.m + templates.m + 2) * probes.n
-    for part in parts(len(out), max(1, _TILE_BYTES.get(there.type, 128 << 20) // 4 // numbers)):
-        left, right = (stacked(side[part], metric, there) for side in (probes, templates))
-        with ieee_products(there):
-            block = left.rows.transpose(0, 1) @ right.rows.permute(1, 2, 0)
-            squares = left.squares, right.squares
-            out[part] = _distances(block, *squares, metric=metric, steps=steps).cpu().numpy()
-    near = np.flatnonzero(~((out >= NEAR) & (out < np.inf)))
-    out[near] = exact.pairs(probes, templates, near, near, metric=metric, steps=steps)
-    return out
 
 
 def stacked(side: Probes, metric: Metric, device: torch.device) -> Rows:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from templates.decoys import Attributes, DecoyPool, DecoySource
-from templates.distances import Metric, on_device, paired_distances, similarity
+from templates.distances import Metric, paired_distances, similarity
 from templates.keys.randomness import Keystream
 from templates.space.lifting import Strategy, lift
 from templates.space.subspace import SubspaceBatch
@@ -93,8 +93,7 @@ def compare(
                     probes, templates = points[0], batches[1]
                 case _:
                     probes, templates = batches
-            with on_device(plan.device):
-                distances = paired_distances(probes, templates, metric=metric, steps=plan.steps)
+            distances = paired_distances(probes, templates, metric=metric, steps=plan.steps)
             column[rows_of_tile] = similarity(distances.astype(np.float64))
     return [
         (

@@ -57,8 +57,6 @@ class EvaluationPlan:
         Everything random is repeated with the seeds ``seed … seed + repeats − 1``.
     steps
         Of the spherical iteration.
-    device
-        Of torch, for subspace-to-subspace distances; None for the processor.
     """
 
     strategies: tuple[str, ...]
@@ -70,7 +68,6 @@ class EvaluationPlan:
     seed: int = 0
     targets: tuple[float, ...] = TARGETS
     steps: int = DEFAULT_STEPS
-    device: str | None = None
 
     def __post_init__(self) -> None:
         unknown = [name for name in self.strategies if name not in STRATEGIES]

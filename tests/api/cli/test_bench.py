@@ -65,7 +65,7 @@ def test_the_authors_formula_gives_the_distances():
     for probes in (face_like(8, 64, stream=stream), face_like_templates(8, 2, 64, stream=stream)):
         np.testing.assert_allclose(
             authors_distances(probes, templates),
-            pairwise_distances(probes, templates, metric="euclidean", dtype=np.float64),
+            pairwise_distances(probes, templates, metric="euclidean"),
             rtol=1e-4,
         )
 

@@ -26,7 +26,6 @@ USAGE: list[tuple[list[str], str]] = [
     (["--fmr", "low"], "--fmr takes rates such as 1e-2,1e-3, not 'low'"),
     (["--fmr", "1"], "FMR targets lie between 0 and 1, such as 1e-2"),
     (["--fmr", "nan"], "FMR targets lie between 0 and 1, such as 1e-2"),
-    (["--device", "nowhere"], "; leave out --device to use the processor"),
     (["--strategy", "raw,raw+flip", "--flip"], "it needs a pack, and no --flip"),
     (["--pack", "none"], "give --pack none --embeddings FILE"),
     (["--embeddings", "EMBEDDINGS"], "give a pack, or --pack none and --embeddings, not both"),

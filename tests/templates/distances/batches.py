@@ -28,7 +28,7 @@ def backend(name: str) -> tuple[ModuleType, dict[str, Any]]:
         pytest.importorskip("numba", reason="numba is of the extra evaluate")
         from templates.distances import compiled
 
-        return compiled, {"threads": 2}
+        return compiled, {}
     pytest.importorskip("torch", reason="torch is an optional extra")
     from templates.distances import torch
 

@@ -16,6 +16,7 @@ from templates.distances import (
     DEFAULT_STEPS,
     Metric,
     exact,
+    nearest,
     paired_distances,
     pairwise_distances,
     similarity,
@@ -202,6 +203,16 @@ def test_a_matrix_of_lifted_pairs_is_made_of_its_pairs(dtype: type, atol: float)
         np.testing.assert_allclose(similarity(seen), similarity(expected), rtol=0, atol=atol)
 
 
+def test_a_leading_eigenvector_that_is_orthogonal_to_the_start_of_the_loops() -> None:
+    inside = np.array([[0.6, 0.02], [0.02, 0.6]])
+    left, right = np.zeros((2, 16)), np.eye(2, 16)
+    left[:, :2], left[:, 2:4] = inside, np.linalg.cholesky(np.eye(2) - inside @ inside.T)
+    a, b = (SubspaceBatch(np.zeros((1, 16)), rows[None]) for rows in (left, right))
+    seen = matrix("compiled", a, b, metric="spherical", steps=200)
+    expected = matrix("exact", a, b, metric="spherical", steps=200)
+    np.testing.assert_allclose(seen, expected, atol=1e-4)
+
+
 # --- convergence of the spherical iteration ----------------------------------------------------
 
 
@@ -250,7 +261,7 @@ def test_more_steps_never_lower_the_similarity(kind: str):
         "crossing": (randoms(40, 5, seed=1, n=8), randoms(40, 5, seed=2, n=8)),
     }[kind]
     similarities = [
-        similarity(pairwise_distances(a, b, metric="spherical", steps=steps, dtype=np.float64))
+        similarity(matrix("exact", a, b, metric="spherical", steps=steps))
         for steps in (1, 2, 3, 4, 5, 6, 7, 8, 13, 30, DEFAULT_STEPS, 200)
     ]
     far = similarities[-1] < 0.99  # nearer pairs get steps of their own in float64
@@ -275,9 +286,8 @@ def test_distances_obey_the_order_of_the_sets(m: int, k: int, seed: int, metric:
     x, y = units(stream, 3), units(stream, 4)
     a = lift(x, strategy="random", m=m, stream=stream)
     b = lift(y, strategy="random", m=k, stream=stream)
-    options = {"metric": metric, "dtype": np.float64}
-    subspaces = pairwise_distances(a, b, **options)
-    points = pairwise_distances(x, b, **options)
+    subspaces = matrix("exact", a, b, metric=metric)
+    points = matrix("exact", x, b, metric=metric)
     raw = np.linalg.norm(x[:, None] - y[None], axis=2)
     # The iteration may stop short of the nearest points of two spheres (docs/method.md §3.5).
     short = 1e-4 if metric == "spherical" else 1e-6
@@ -287,25 +297,23 @@ def test_distances_obey_the_order_of_the_sets(m: int, k: int, seed: int, metric:
     # radius of what they share: 2e-4 is met once in a thousand random subspaces of one dimension.
     radii = np.sqrt(np.maximum(1 - b.foot_norms**2, 1e-12))
     assert (points <= raw + 1e-6 + np.finfo(np.float32).eps / 2 / radii).all()
-    np.testing.assert_allclose(pairwise_distances(b, a, **options), subspaces.T, atol=short)
-    euclidean = pairwise_distances(a, b, metric="euclidean", dtype=np.float64)
+    np.testing.assert_allclose(matrix("exact", b, a, metric=metric), subspaces.T, atol=short)
+    euclidean = matrix("exact", a, b, metric="euclidean")
     assert (euclidean <= subspaces + 1e-6).all()
     # A larger set is nearer: the first m directions of a, and those with more.
     if m > 1:
         smaller = SubspaceBatch(a.feet, a.bases[:, :-1])
-        assert (subspaces <= pairwise_distances(smaller, b, **options) + 1e-6).all()
+        assert (subspaces <= matrix("exact", smaller, b, metric=metric) + 1e-6).all()
 
 
 @pytest.mark.parametrize("metric", METRICS)
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
-def test_paired_is_the_diagonal_of_pairwise(metric: str, dtype: str):
+def test_paired_is_the_diagonal_of_pairwise(metric: str):
     a, b = faces(15, 4, seed=9), faces(15, 7, seed=10)
-    options = {"metric": metric, "dtype": dtype}
-    for probes in (a, units(Keystream.seeded(1), 15, 128).astype(dtype)):
-        paired = paired_distances(probes, b, **options)
-        assert paired.dtype == dtype
+    for probes in (a, units(Keystream.seeded(1), 15, 128)):
+        paired = paired_distances(probes, b, metric=metric)
+        assert paired.dtype == np.float32
         assert paired.shape == (15,)
-        expected = np.diagonal(pairwise_distances(probes, b, **options))
+        expected = np.diagonal(pairwise_distances(probes, b, metric=metric))
         np.testing.assert_allclose(paired, expected, atol=2e-6)
 
 
@@ -356,33 +364,37 @@ def test_zero_probe_is_as_far_as_the_method_says():
         np.testing.assert_allclose(distances, np.sqrt(2), rtol=1e-6)
 
 
-@pytest.mark.parametrize("metric", METRICS)
-def test_wrong_probes_and_templates_are_refused(metric: str):
-    templates = randoms(3, 4, seed=16)
-    points = units(Keystream.seeded(5), 2)
-    broken, other = points.copy(), randoms(2, 4, seed=17, n=N + 1)
-    broken[0, 0] = np.nan
-    feet = templates.feet.copy()
-    feet[1, 1] = np.inf
-    for measure in (pairwise_distances, paired_distances):
-        with pytest.raises(InvalidEmbedding, match="not finite"):
-            measure(broken, templates, metric=metric)
-        with pytest.raises(InvalidEmbedding, match="shape"):
-            measure(points[:, :-1], templates, metric=metric)
-        with pytest.raises(InvalidEmbedding, match="shape"):
-            measure(points[0], templates, metric=metric)
-        with pytest.raises(InvalidTemplate, match="does not fit"):
-            measure(other, templates, metric=metric)
-        with pytest.raises(InvalidTemplate, match="not finite"):
-            measure(points, SubspaceBatch(feet, templates.bases), metric=metric)
-        with pytest.raises(TemplateError, match="float32 or float64"):
-            measure(points, templates, metric=metric, dtype=np.float16)
-        with pytest.raises(TemplateError, match="at least one step"):
-            measure(points, templates, metric=metric, steps=0)
-        with pytest.raises(ValueError, match="is not a valid Metric"):
-            measure(points, templates, metric="cosine")
+POINTS, TEMPLATES = units(Keystream.seeded(5), 3), randoms(3, 4, seed=16)
+BROKEN = SubspaceBatch(TEMPLATES.feet * np.inf, TEMPLATES.bases)
+
+
+@pytest.mark.parametrize(
+    ("probes", "templates", "options", "error", "message"),
+    [
+        (POINTS * np.nan, TEMPLATES, {}, InvalidEmbedding, "not finite"),
+        (POINTS * 1e39, TEMPLATES, {}, InvalidEmbedding, "not finite"),
+        (POINTS[:, :-1], TEMPLATES, {}, InvalidEmbedding, "shape"),
+        (POINTS[0], TEMPLATES, {}, InvalidEmbedding, "shape"),
+        (randoms(3, 4, seed=17, n=N + 1), TEMPLATES, {}, InvalidTemplate, "does not fit"),
+        (POINTS, BROKEN, {}, InvalidTemplate, "not finite"),
+        (BROKEN, TEMPLATES, {}, InvalidTemplate, "not finite"),
+        (POINTS, TEMPLATES, {"steps": 0}, TemplateError, "at least one step"),
+        (POINTS, TEMPLATES, {"metric": "cosine"}, ValueError, "is not a valid Metric"),
+    ],
+)
+@pytest.mark.parametrize("measure", [pairwise_distances, paired_distances])
+def test_wrong_probes_templates_and_options_are_refused(
+    measure, probes, templates, options, error: type[Exception], message: str
+):
+    with pytest.raises(error, match=message):
+        measure(probes, templates, **{"metric": "spherical", **options})
+
+
+def test_wrong_counts_are_refused():
     with pytest.raises(TemplateError, match="do not pair"):
-        paired_distances(points, templates, metric=metric)
+        paired_distances(POINTS[:2], TEMPLATES, metric="spherical")
+    with pytest.raises(TemplateError, match="at least 1"):
+        nearest(POINTS, TEMPLATES, k=0, metric="spherical")
 
 
 def test_similarity_is_the_cosine_of_unit_points():

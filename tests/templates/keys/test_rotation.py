@@ -138,8 +138,8 @@ def test_a_probe_that_is_turned_as_the_template_is_as_far_from_it(metric: Metric
     b = lift(others, strategy="random", m=7, stream=stream)
     turned = TenantRotation(b"r" * 32, 40).of("template").turned
     for probes, moved in ((points, turned(points)), (a, a.turned_by(turned))):
-        before = pairwise_distances(probes, b, metric=metric, dtype=np.float64)
-        after = pairwise_distances(moved, b.turned_by(turned), metric=metric, dtype=np.float64)
+        before = pairwise_distances(probes, b, metric=metric)
+        after = pairwise_distances(moved, b.turned_by(turned), metric=metric)
         np.testing.assert_allclose(after, before, atol=1e-6)
 
 

@@ -6,7 +6,6 @@ import pytest
 
 from templates.decoys import Attributes, DecoyGenerator, DecoyPool
 from templates.distances import Metric, similarity
-from templates.errors import TemplateError
 from templates.keys.randomness import Keystream
 from templates.space.lifting import Strategy, lift
 from tests.verify.evaluation.made_trials import N, made_trials, pool
@@ -91,16 +90,6 @@ def test_both_photos_are_projected_on_the_axes_of_a_generator() -> None:
     for row in range(30):
         distance = residual(probes[row], lifted[row].foot, lifted[row].basis)
         assert found[row] == pytest.approx(similarity(distance), abs=1e-5)
-
-
-def test_a_device_gives_the_similarities_of_the_processor() -> None:
-    pytest.importorskip("torch", reason="torch is an optional extra")
-    known = made_trials(pairs=30)
-    here, there = (compared(known, device=device) for device in (None, "cpu"))
-    for name, similarities in here.items():
-        np.testing.assert_allclose(similarities, there[name], atol=5e-6)
-    with pytest.raises(TemplateError, match="torch cannot use the device nowhere"):
-        compared(known, device="nowhere")
 
 
 def test_halves_are_disjoint_and_cover_the_pool() -> None:
