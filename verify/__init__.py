@@ -6,7 +6,7 @@ Imports the layer below only: ``templates`` and ``models``.
 from verify.calibration import Calibrated, calibrate
 from verify.calibration_mode import CalibrationOptions, CalibrationReport
 from verify.challenge import MAX_FRAMES, MIN_FRAMES, Movement, draw_movements
-from verify.datasets import DatasetError, LabelledFolder, labelled_folder, read_lfw_pairs
+from verify.datasets import DatasetError, LabelledFolder, labelled_folder
 from verify.decision import Decision, StandIn
 from verify.photo_probe import (
     MAX_PROBE_PHOTOS,
@@ -38,5 +38,4 @@ __all__ = [
     "probe_of_embeddings",
     "probe_of_frames",
     "probe_of_photos",
-    "read_lfw_pairs",
 ]

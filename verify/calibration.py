@@ -22,11 +22,11 @@ from verify.calibration_mode import (
     calibrate_points,
     point_sets,
 )
-from verify.comparisons import Lifter, Progress, honest_norms
+from verify.comparisons import Comparison, Lifter, Progress, honest_norms
 from verify.consistency import photo_consistency, suspicious_pairs
 from verify.group_rates import PeopleGroups, PhotoLabels, people_groups
-from verify.tenfold import Pair, pair_arrays, random_pairs, require_folds
-from verify.trials import ProbeSets, TrialPlan, chosen_photos, enrolled_means, plan_trials
+from verify.tenfold import random_pairs
+from verify.trials import ProbeSets, chosen_photos, enrolled_means, plan_trials
 
 SUSPICIOUS_ABOVE = 0.5
 """Raw cosine from which two people are reported as suspiciously alike. On LFW with ArcFace the
@@ -62,7 +62,6 @@ def calibrate(
     options: CalibrationOptions | None = None,
     exclude: Collection[str] = (),
     labels: PhotoLabels | None = None,  # of every embedding, for rates by group of people
-    pairs: Sequence[Pair] | None = None,  # of the ten-fold protocol; random ones by default
     cohort_seed: bytes | None = None,  # a contract's, to keep its cohort
     recorded: Mapping[str, Json] | None = None,  # facts for the contract file
     dataset: str = "labelled folder",
@@ -108,7 +107,9 @@ def calibrate(
         groups = people_groups(labels, kept, plan.person_of, people=len(plan.people))
     if options.worst_group and not groups:
         raise ContractError("thresholds by the worst group need labels of the people")
-    placed = _protocol_pairs(options, pairs, kept, plan, rng)
+    pairs = None
+    if options.protocol == "ten-fold":
+        pairs = random_pairs(plan.person_of, rng=rng)
     consistency = photo_consistency(
         data, plan.person_of, photos=options.photos_per_enrollment, rng=rng
     )
@@ -130,11 +131,16 @@ def calibrate(
     run = CalibrationRun(
         embeddings=data,
         plan=plan,
-        templates=templates,
-        nobody=Nobody(generator, binding.strategy, binding.m, cohort_seed),
+        comparison=Comparison(
+            plan,
+            templates,
+            Nobody(generator, binding.strategy, binding.m, cohort_seed),
+            options.metric,
+            options.steps,
+        ),
         service=service,
         client=Lifter(plain_strategy(binding.strategy), generator, binding.contract_id),
-        pairs=placed,
+        pairs=pairs,
         groups=groups,
         report=report,
         options=options,
@@ -175,7 +181,8 @@ def _contract(
     calibrations: Sequence[Calibration],
     recorded: Mapping[str, Json],
 ) -> Contract:
-    consistency, near = run.report.consistency, run.nobody.stranger_similarity(run.templates)
+    consistency, templates = run.report.consistency, run.comparison.templates
+    near = run.comparison.nobody.stranger_similarity(templates)
     return Contract(
         binding=binding,
         recorded={
@@ -187,36 +194,10 @@ def _contract(
         default_level=_default_level(calibrations),
         photo_consistency=consistency.threshold,
         probe_consistency=consistency.probe_threshold,
-        template_foot_point_norm=honest_norms(run.templates.foot_norms),
+        template_foot_point_norm=honest_norms(templates.foot_norms),
         template_stranger_similarity=float(near.mean() + DEVIATIONS * near.std()),
-        cohort_seed=run.nobody.cohort_seed,
+        cohort_seed=run.comparison.nobody.cohort_seed,
     )
-
-
-def _protocol_pairs(
-    options: CalibrationOptions,
-    pairs: Sequence[Pair] | None,
-    kept: NDArray[np.int64],
-    plan: TrialPlan,
-    rng: np.random.Generator,
-) -> tuple[Pair, ...]:
-    if options.protocol == "fmr":
-        return ()
-    if pairs is None:
-        return tuple(random_pairs(plan.person_of, rng=rng))
-    place = {int(photo): position for position, photo in enumerate(kept)}
-    staying = [
-        (place[pair.first], place[pair.second], pair.fold)
-        for pair in pairs
-        if pair.first in place and pair.second in place
-    ]
-    # Two names of one person make a pair of the protocol genuine, whatever its file says.
-    placed = tuple(
-        Pair(first, second, bool(plan.person_of[first] == plan.person_of[second]), fold)
-        for first, second, fold in staying
-    )
-    require_folds(pair_arrays(placed)[1])
-    return placed
 
 
 def _default_level(calibrations: Sequence[Calibration]) -> str:

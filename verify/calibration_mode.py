@@ -10,24 +10,15 @@ from numpy.typing import NDArray
 from templates.contract.canonical import Json
 from templates.contract.document import Calibration
 from templates.contract.levels import photos_in_words
-from templates.contract.nobody import Nobody
 from templates.distances import Metric
 from templates.errors import ContractError
 from templates.keys.randomness import Keystream
-from templates.space.subspace import SubspaceBatch
-from verify.cohort import Probes, expected_similarity
-from verify.comparisons import (
-    Lifter,
-    Progress,
-    honest_norms,
-    lifted_trials,
-    pair_similarities,
-    point_trials,
-)
+from verify.cohort import Probes
+from verify.comparisons import Comparison, Lifter, Progress, honest_norms, pair_similarities
 from verify.consistency import Consistency, SuspiciousPair
 from verify.group_rates import PeopleGroups, group_rates, worst_group_threshold
 from verify.metrics import threshold_at_fmr
-from verify.tenfold import Pair, TenFold, pair_arrays, ten_fold
+from verify.tenfold import Pairs, TenFold, ten_fold
 from verify.thresholds import (
     EXPECTED_ERRORS,
     TARGETS,
@@ -38,7 +29,7 @@ from verify.thresholds import (
     make_level,
     resolved_targets,
 )
-from verify.trials import ProbeSets, TrialPlan, probe_sets
+from verify.trials import GROUP, ProbeSets, TrialPlan, impostor_groups, probe_sets
 
 Protocol: TypeAlias = Literal["fmr", "ten-fold"]
 
@@ -103,11 +94,10 @@ class CalibrationRun:
 
     embeddings: NDArray[np.float32]
     plan: TrialPlan
-    templates: SubspaceBatch
-    nobody: Nobody
+    comparison: Comparison
     service: Lifter
     client: Lifter
-    pairs: tuple[Pair, ...]
+    pairs: Pairs | None  # of the ten-fold protocol
     groups: tuple[PeopleGroups, ...]
     report: CalibrationReport
     options: CalibrationOptions
@@ -117,7 +107,7 @@ class CalibrationRun:
 
 def point_sets(run: CalibrationRun, rng: np.random.Generator) -> list[ProbeSets]:
     """Choose the raw probes of every number of photos that the people allow."""
-    templates, options = len(run.templates), run.options
+    templates, options = len(run.plan.compared), run.options
     times = GROUPED if run.groups else 1
     chosen = []
     for photos in sorted(options.probe_photos):
@@ -131,45 +121,57 @@ def point_sets(run: CalibrationRun, rng: np.random.Generator) -> list[ProbeSets]
 
 
 def calibrate_points(run: CalibrationRun, sets: ProbeSets) -> Calibration:
-    """Calibrate raw probes of one number of photos."""
-    impostors, genuine = point_trials(
-        run.embeddings,
-        run.plan,
-        run.templates,
-        run.nobody,
-        sets,
-        metric=run.options.metric,
-        consistency=run.report.consistency.probe_threshold,
-        progress=run.progress,
+    """Compare raw probes of one number of photos with everybody's template, and set the levels."""
+    photos = sets.photos.shape[1]
+    what = f"comparing probes of {photos_in_words(photos)} with templates"
+    project = run.comparison.nobody.generator.project
+    points = project(sets.means(run.embeddings, sets.impostor))
+    impostors = run.comparison.impostors(
+        points,
+        run.comparison.expected(points),
+        run.plan.person_of[sets.photos[sets.impostor, 0]],
+        run.plan.compared[None],
+        size=len(sets.impostor),
+        progress=lambda share: run.progress(what, share),
     )
-    return _calibration(run, impostors, genuine, probe_photos=sets.photos.shape[1])
+    own = run.plan.person_of[sets.photos[: sets.genuine, 0]]
+    consistency = run.report.consistency.probe_threshold
+    refused = sets.disagreeing(run.embeddings, consistency=consistency)
+    points = np.empty((0, run.comparison.templates.n), dtype=np.float32)
+    if len(own):
+        points = project(sets.means(run.embeddings, slice(sets.genuine)))
+    genuine = run.comparison.genuine(points, run.comparison.expected(points), own, refused)
+    return _calibration(run, impostors, genuine, probe_photos=photos)
 
 
 def calibrate_lifted(run: CalibrationRun, probe_m: int, rng: np.random.Generator) -> Calibration:
-    """Calibrate lifted probes of one dimension."""
-    options = run.options
-    stream = Keystream.seeded("calibration probes", options.seed, probe_m)
-    impostors, genuine, norms = lifted_trials(
-        run.embeddings,
-        run.plan,
-        run.templates,
-        run.nobody.cohort,
-        run.client,
-        probe_m=probe_m,
-        metric=options.metric,
-        steps=options.steps,
-        most_probes=options.lifted_probes,
-        impostor_pairs=options.lifted_impostor_pairs,
-        rng=rng,
-        stream=stream,
-        progress=run.progress,
+    """Compare lifted probes of one dimension, and set the levels.
+
+    At most ``lifted_probes`` photos probe, genuine ones first. Groups of them meet groups of other
+    people's templates, about ``lifted_impostor_pairs`` pairs in all.
+    """
+    plan, most = run.plan, run.options.lifted_probes
+    photos = plan.genuine
+    if len(photos) > most:
+        photos = rng.choice(photos, most, replace=False)
+    extra = np.setdiff1d(np.arange(len(plan.person_of)), plan.genuine)
+    room = min(len(extra), most - len(photos))
+    chosen = np.concatenate([photos, rng.choice(extra, room, replace=False)])
+    stream = Keystream.seeded("calibration probes", run.options.seed, probe_m)
+    probes = run.client.lift(run.embeddings[chosen], m=probe_m, stream=stream)
+    expected = run.comparison.expected(probes)
+    impostors = run.comparison.impostors(
+        probes,
+        expected,
+        plan.person_of[chosen],
+        impostor_groups(plan, len(chosen), pairs=run.options.lifted_impostor_pairs, rng=rng),
+        size=GROUP,
+        progress=lambda share: run.progress(f"comparing lifted probes, m = {probe_m}", share),
     )
+    refused = np.zeros(len(photos), dtype=np.bool_)
+    genuine = run.comparison.genuine(probes, expected, plan.person_of[photos], refused)
     return _calibration(
-        run,
-        impostors,
-        genuine,
-        probe_m=probe_m,
-        norms=honest_norms(norms),
+        run, impostors, genuine, probe_m=probe_m, norms=honest_norms(probes.foot_norms)
     )
 
 
@@ -191,8 +193,8 @@ def _calibration(
         for target, threshold in zip(kept, thresholds, strict=True)
     ]
     folds = None
-    if options.protocol == "ten-fold" and probe_photos == 1:
-        folds = _ten_fold(run, probe_m)
+    if run.pairs is not None and probe_photos == 1:
+        folds = _ten_fold(run, run.pairs, probe_m)
         levels.append(
             make_level(
                 ACCURACY_LEVEL, None, folds.threshold_mean, impostors, genuine, seed=options.seed
@@ -261,17 +263,16 @@ def _thresholds(
     return thresholds, unheeded
 
 
-def _ten_fold(run: CalibrationRun, probe_m: int) -> TenFold:
+def _ten_fold(run: CalibrationRun, pairs: Pairs, probe_m: int) -> TenFold:
     """Paper's protocol: one photo enrolled, one photo as the probe, raw or lifted."""
-    firsts = np.array([pair.first for pair in run.pairs], dtype=np.int64)
-    seconds = np.array([pair.second for pair in run.pairs], dtype=np.int64)
-    enrolled, numbers = np.unique(firsts, return_inverse=True)
-    probing, positions = np.unique(seconds, return_inverse=True)
+    enrolled, numbers = np.unique(pairs.first, return_inverse=True)
+    probing, positions = np.unique(pairs.second, return_inverse=True)
     options = run.options
     stream = Keystream.seeded("ten folds", options.seed, probe_m)
-    templates = run.service.lift(run.embeddings[enrolled], m=run.templates.m, stream=stream)
+    m = run.comparison.templates.m
+    templates = run.service.lift(run.embeddings[enrolled], m=m, stream=stream)
     raw = run.embeddings[probing]
-    probes: Probes = run.nobody.generator.project(raw)
+    probes: Probes = run.comparison.nobody.generator.project(raw)
     if probe_m:
         probes = run.client.lift(raw, m=probe_m, stream=stream)
     close = pair_similarities(
@@ -282,6 +283,5 @@ def _ten_fold(run: CalibrationRun, probe_m: int) -> TenFold:
         metric=options.metric,
         steps=options.steps,
     )
-    statistics = expected_similarity(probes, run.nobody, metric=options.metric, steps=options.steps)
-    means, spreads = (part[positions] for part in statistics)
-    return ten_fold((close - means) / spreads, *pair_arrays(run.pairs))
+    means, spreads = (part[positions] for part in run.comparison.expected(probes))
+    return ten_fold((close - means) / spreads, pairs.same, pairs.folds)

@@ -11,11 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from templates.contract import wire
-from templates.contract.levels import photos_in_words
 from templates.contract.nobody import Nobody
 from templates.decoys import Attributes, DecoySource
 from templates.distances import (
-    DEFAULT_STEPS,
     Metric,
     paired_distances,
     pairwise_distances,
@@ -24,9 +22,9 @@ from templates.distances import (
 from templates.keys.randomness import Keystream
 from templates.space.lifting import Strategy, lift
 from templates.space.subspace import SubspaceBatch
-from verify.cohort import Probes, cohort_statistics
-from verify.thresholds import Genuine, Impostors
-from verify.trials import Indices, ProbeSets, TrialPlan, impostor_groups
+from verify.cohort import Probes, expected_similarity
+from verify.thresholds import Genuine, Impostors, Indices
+from verify.trials import TrialPlan
 
 WIRE_DTYPE: wire.WireDtype = "float16"
 PROBE_TILE = 1024
@@ -34,6 +32,8 @@ PROBE_TILE = 1024
 PAIR_TILE_BYTES = 128 * 2**20
 
 Progress = Callable[[str, float], None]
+Advance = Callable[[float], None]
+Expected = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 @dataclass(frozen=True)
@@ -70,149 +70,60 @@ def through_wire(batch: SubspaceBatch, *, contract_id: str) -> SubspaceBatch:
     return SubspaceBatch(feet, bases)
 
 
-def point_trials(
-    embeddings: NDArray[np.float32],
-    plan: TrialPlan,
-    templates: SubspaceBatch,
-    nobody: Nobody,
-    sets: ProbeSets,
-    *,
-    metric: Metric,
-    consistency: float,
-    progress: Progress,
-) -> tuple[Impostors, Genuine]:
-    """Compare raw probes with the template of everybody who is compared."""
-    people, compared = len(plan.people), len(plan.compared)
-    owners = plan.person_of[sets.photos[sets.impostor, 0]]
-    scores = np.empty((len(owners), compared), dtype=np.float32)
-    what = f"comparing probes of {photos_in_words(sets.photos.shape[1])} with templates"
-    for start in range(0, len(owners), PROBE_TILE):
-        rows = slice(start, start + PROBE_TILE)
-        probes = nobody.generator.project(sets.means(embeddings, sets.impostor[rows]))
-        distances = pairwise_distances(probes, templates, metric=metric)
-        means, spreads = nobody.statistics(probes, metric)
-        scores[rows] = (similarity(distances) - means[:, None]) / spreads[:, None]
-        progress(what, min(1.0, (start + PROBE_TILE) / len(owners)))
-    with_template = np.flatnonzero(plan.template_of[owners] >= 0)
-    scores[with_template, plan.template_of[owners[with_template]]] = -np.inf
-    own = plan.person_of[sets.photos[: sets.genuine, 0]]
-    probes = sets.means(embeddings, slice(sets.genuine))
-    if len(probes):
-        probes = nobody.generator.project(probes)
-    else:
-        probes = np.empty((0, templates.n), dtype=np.float32)
-    means, spreads = nobody.statistics(probes, metric)
-    close = pair_similarities(
-        probes,
-        templates,
-        np.arange(len(own)),
-        plan.template_of[own],
-        metric=metric,
-        steps=DEFAULT_STEPS,
-    )
-    genuine = Genuine(
-        ((close - means) / spreads).astype(np.float32),
-        own,
-        _enrolled_photos(plan, own),
-        refused=sets.disagreeing(embeddings, consistency=consistency),
-    )
-    probes_of = np.bincount(owners, minlength=people).astype(np.float64)
+@dataclass(frozen=True, eq=False, repr=False)
+class Comparison:
+    """How probes are scored against the templates of a calibration."""
 
-    def people_of(flat: Indices) -> Indices:
-        return np.stack([owners[flat // compared], plan.compared[flat % compared]], axis=1)
+    plan: TrialPlan
+    templates: SubspaceBatch  # of ``plan.compared``
+    nobody: Nobody
+    metric: Metric
+    steps: int
 
-    def weighted_trials(weights: NDArray[np.float64]) -> float:
-        probe_weights = probes_of * weights
-        others = weights[plan.compared]
-        return float(probe_weights.sum() * others.sum() - probe_weights[plan.compared] @ others)
+    def expected(self, probes: Probes) -> Expected:
+        """Similarity that is expected of every probe, and its spread, each (P,)."""
+        return expected_similarity(probes, self.nobody, metric=self.metric, steps=self.steps)
 
-    probing = int(np.count_nonzero(probes_of))
-    both = int(np.count_nonzero(probes_of[plan.compared]))
-    return Impostors(
-        scores=scores.reshape(-1),
-        trials=len(owners) * compared - len(with_template),
-        people=people,
-        # Unordered: of two who both probe and are compared there are two trials, and one pair.
-        person_pairs=probing * compared - both - both * (both - 1) // 2,
-        people_of=people_of,
-        weighted_trials=weighted_trials,
-    ), genuine
+    def impostors(
+        self,
+        probes: Probes,
+        expected: Expected,
+        owners: Indices,
+        met: Indices,
+        *,
+        size: int,
+        progress: Advance,
+    ) -> Impostors:
+        """Compare each group of ``size`` probes with the people whom it meets, (groups, W)."""
+        means, spreads = expected
+        cells = np.empty((len(owners), met.shape[1]), dtype=np.float32)
+        for group, people in enumerate(met):
+            templates = self.templates
+            if len(people) < len(templates):
+                templates = templates[self.plan.template_of[people]]
+            last = min((group + 1) * size, len(cells))
+            for start in range(group * size, last, PROBE_TILE):
+                rows = slice(start, min(start + PROBE_TILE, last))
+                distances = pairwise_distances(
+                    probes[rows], templates, metric=self.metric, steps=self.steps
+                )
+                cells[rows] = (similarity(distances) - means[rows, None]) / spreads[rows, None]
+                cells[rows][owners[rows, None] == people] = -np.inf
+                progress(rows.stop / len(cells))
+        return Impostors(cells, owners, met, size, len(self.plan.people))
 
-
-def _enrolled_photos(plan: TrialPlan, people: Indices) -> Indices:
-    """Return how many photos made the template of each of some people."""
-    return np.array([len(photos) for photos in plan.enrolled], dtype=np.int64)[people]
-
-
-def lifted_trials(
-    embeddings: NDArray[np.float32],
-    plan: TrialPlan,
-    templates: SubspaceBatch,
-    cohort: SubspaceBatch,
-    lifter: Lifter,
-    *,
-    probe_m: int,
-    metric: Metric,
-    steps: int,
-    most_probes: int,
-    impostor_pairs: int,
-    rng: np.random.Generator,
-    stream: Keystream,
-    progress: Progress,
-) -> tuple[Impostors, Genuine, NDArray[np.float64]]:
-    """Compare lifted probes with their person's template, and with a random subset of others.
-
-    Probes are at most ``most_probes`` photos, genuine ones first. Groups of them meet groups of
-    other people's templates, about ``impostor_pairs`` pairs in all. Also returns the norms of
-    their foot points.
-    """
-    what = f"comparing lifted probes, m = {probe_m}"
-    genuine_photos = plan.genuine
-    if len(genuine_photos) > most_probes:
-        genuine_photos = rng.choice(genuine_photos, most_probes, replace=False)
-    extra = np.setdiff1d(np.arange(len(plan.person_of)), plan.genuine)
-    room = min(len(extra), most_probes - len(genuine_photos))
-    chosen = np.concatenate([genuine_photos, rng.choice(extra, room, replace=False)])
-    owners = plan.person_of[chosen]
-    probes = lifter.lift(embeddings[chosen], m=probe_m, stream=stream)
-    means, spreads = np.empty(len(chosen)), np.empty(len(chosen))
-    scores: list[NDArray[np.float32]] = []
-    met: list[Indices] = []
-    for rows, people in impostor_groups(plan, len(chosen), pairs=impostor_pairs, rng=rng):
-        group = probes[rows]
-        means[rows], spreads[rows] = cohort_statistics(group, cohort, metric=metric, steps=steps)
-        distances = pairwise_distances(
-            group, templates[plan.template_of[people]], metric=metric, steps=steps
-        )
-        z = ((similarity(distances) - means[rows, None]) / spreads[rows, None]).astype(np.float32)
-        others = owners[rows, None] != people[None, :]
-        row, column = np.nonzero(others)
-        scores.append(z[others])
-        met.append(np.stack([owners[rows][row], people[column]], axis=1))
-        progress(what, rows.stop / len(chosen))
-    pair_people = np.concatenate(met)
-    own = owners[: len(genuine_photos)]
-    first = np.arange(len(own), dtype=np.int64)
-    close = pair_similarities(
-        probes, templates, first, plan.template_of[own], metric=metric, steps=steps
-    )
-    keys, repeats = np.unique(pair_people, axis=0, return_counts=True)
-    unordered = np.unique(np.sort(keys, axis=1), axis=0)
-
-    def weighted_trials(weights: NDArray[np.float64]) -> float:
-        return float(repeats @ (weights[keys[:, 0]] * weights[keys[:, 1]]))
-
-    impostors = Impostors(
-        scores=np.concatenate(scores),
-        trials=len(pair_people),
-        people=len(plan.people),
-        person_pairs=len(unordered),
-        people_of=lambda flat: pair_people[flat],
-        weighted_trials=weighted_trials,
-    )
-    z = ((close - means[: len(own)]) / spreads[: len(own)]).astype(np.float32)
-    genuine = Genuine(z, own, _enrolled_photos(plan, own), refused=np.zeros(len(own), np.bool_))
-    return impostors, genuine, probes.foot_norms
+    def genuine(
+        self, probes: Probes, expected: Expected, own: Indices, refused: NDArray[np.bool_]
+    ) -> Genuine:
+        """Compare the first probes, as many as ``own``, with the templates of their people."""
+        means, spreads = (part[: len(own)] for part in expected)
+        close = pair_similarities(
+            probes, self.templates, np.arange(len(own)), self.plan.template_of[own],
+            metric=self.metric, steps=self.steps,
+        )  # fmt: skip
+        scores = ((close - means) / spreads).astype(np.float32)
+        enrolled = np.array([len(photos) for photos in self.plan.enrolled], dtype=np.int64)[own]
+        return Genuine(scores, own, enrolled, refused)
 
 
 def pair_similarities(

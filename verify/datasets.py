@@ -3,7 +3,6 @@
 import csv
 import hashlib
 import io
-import re
 from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -11,15 +10,13 @@ from pathlib import Path
 
 from templates.errors import VeilfaceError
 from templates.keys.private_file import read_at_most
-from verify.tenfold import FOLDS, Pair
 
 SUFFIXES = frozenset({".jpg", ".jpeg", ".jfif", ".png", ".webp", ".bmp"})
 MAX_PAIRS_BYTES = 16 * 2**20
-_MOST_SHOWN = 20
 
 
 class DatasetError(VeilfaceError):
-    """A data set that is not laid out as its reader expects; the message lists what is wrong."""
+    """A data set that is not laid out as its reader expects; the message names the first fault."""
 
 
 @dataclass(frozen=True)
@@ -117,76 +114,6 @@ def distinct_files(files: Sequence[Path]) -> list[Path]:
     return list(distinct.values())
 
 
-@dataclass(frozen=True)
-class Trial:
-    """One comparison of a protocol; photos by a key that is unique in the set."""
-
-    first: str
-    second: str
-    same: bool
-    fold: int | None = None
-
-
-def read_lfw_pairs(
-    file: Path | str, paths: Sequence[Path], *, missing: Collection[Path] = ()
-) -> list[Pair]:
-    """Read LFW's ``pairs.txt`` into positions in ``paths``."""
-    path = Path(file)
-    text = decoded(read_whole(path, most=MAX_PAIRS_BYTES), file=path)
-    index = {f"{entry.parent.name}/{entry.stem}": number for number, entry in enumerate(paths)}
-    gone = {f"{entry.parent.name}/{entry.stem}" for entry in missing}
-    pairs: list[Pair] = []
-    faults: list[str] = []
-    for number, one in enumerate(parse_lfw_pairs(path, text)):
-        keys = (one.first, one.second)
-        absent = [key for key in keys if key not in index and key not in gone]
-        if absent:
-            faults.append(f"line {number + 2} names {absent[0]}, which is not there")
-        elif not gone & {*keys}:
-            pairs.append(Pair(index[one.first], index[one.second], one.same, one.fold or 0))
-    if faults:
-        raise DatasetError(faults_in(path, "expected LFW's pairs format", faults))
-    return pairs
-
-
-def parse_lfw_pairs(path: Path, text: str) -> list[Trial]:
-    """Parse the text of LFW's ``pairs.txt``: keys are ``Name/Name_0001``; ``path`` is for messages.
-
-    The header is ``folds<TAB>pairs per class and fold``; every fold then has that many lines
-    ``Name i j`` of one person and as many lines ``NameA i NameB j`` of two.
-    """
-    header, *lines = text.rstrip().splitlines() or [""]
-    if not (match := re.fullmatch(r"(\d{1,6})\s+(\d{1,6})", header.strip())):
-        raise DatasetError(f"{path.name} does not begin with: folds, pairs per class and fold")
-    folds, per_class = map(int, match.groups())
-    if folds != FOLDS or per_class < 1:
-        raise DatasetError(f"{path.name} has {folds} folds; the protocol has {FOLDS}")
-    if len(lines) != 2 * folds * per_class:
-        raise DatasetError(
-            f"{path.name} promises {2 * folds * per_class} pairs and holds {len(lines)}"
-        )
-    trials: list[Trial] = []
-    faults: list[str] = []
-    for number, line in enumerate(lines):
-        fold, place = divmod(number, 2 * per_class)
-        same = place < per_class
-        parts = line.split("\t") if "\t" in line else line.split()
-        fits = len(parts) == (3 if same else 4)
-        parts[2:2] = parts[:1] if same else []
-        if not fits or not all(re.fullmatch(r"\d{1,6}", part) for part in parts[1::2]):
-            form = "Name i j" if same else "NameA i NameB j"
-            faults.append(f"line {number + 2} is not of the form {form}")
-            continue
-        one, other = (
-            f"{name}/{name}_{int(photo):04d}"
-            for name, photo in zip(parts[::2], parts[1::2], strict=True)
-        )
-        trials.append(Trial(one, other, same, fold))
-    if faults:
-        raise DatasetError(faults_in(path, "expected LFW's pairs format", faults))
-    return trials
-
-
 def read_whole(file: Path, *, most: int) -> bytes:
     """Read a file of at most ``most`` bytes."""
     try:
@@ -251,11 +178,3 @@ def _fault_of_header(
     if len(set(header)) < len(header) or "" in header:
         return "names a column twice, or not at all"
     return None
-
-
-def faults_in(where: Path, expected: str, faults: Sequence[str]) -> str:
-    """Word the message of a :class:`DatasetError`: the first faults, and how many more."""
-    shown = "; ".join(faults[:_MOST_SHOWN])
-    more = f"; and {len(faults) - _MOST_SHOWN} more" if len(faults) > _MOST_SHOWN else ""
-    count = f"{len(faults)} fault{'s' if len(faults) > 1 else ''}"
-    return f"{where} has {count}, {expected}: {shown}{more}"

@@ -1,8 +1,9 @@
 """The threshold of a level, for a stated false match rate on impostor trials."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,18 +25,61 @@ RESAMPLES = 200
 
 Scores = NDArray[np.float32]
 Array64 = NDArray[np.float64]
+Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Impostors:
-    """Impostor trials of one calibration."""
+    """Impostor trials of one calibration: each probe meets the templates of W people.
 
-    scores: Scores  # (R,); minus infinity where a probe meets its own person, which is no trial
-    trials: int
+    Probes are in groups of one size, but for the last; all of a group meet the same people.
+    """
+
+    cells: Scores  # (R, W); minus infinity where a probe meets its own person, which is no trial
+    owners: Indices  # (R,) people of the probes
+    met: Indices  # (groups, W) people whose templates they meet
+    size: int  # of a group
     people: int
-    person_pairs: int  # distinct and unordered
-    people_of: Callable[[NDArray[np.int64]], NDArray[np.int64]]  # positions (E,) to people (E, 2)
-    weighted_trials: Callable[[Array64], float]  # their weight under (people,) bootstrap weights
+
+    @property
+    def scores(self) -> Scores:
+        """All cells in one row, (R W,)."""
+        return self.cells.reshape(-1)
+
+    @cached_property
+    def trials(self) -> int:
+        """Number of the cells that are trials."""
+        return int(np.count_nonzero(np.isfinite(self.cells)))
+
+    def people_of(self, places: Indices) -> Indices:
+        """Give the two people of cells, (E,) to (E, 2)."""
+        row, column = np.divmod(places, self.cells.shape[1])
+        return np.stack([self.owners[row], self.met[row // self.size, column]], axis=1)
+
+    @cached_property
+    def _by_group(self) -> tuple[Array64, Array64, Array64]:
+        """Probes of each person in each group, whether it meets them, and probes that meet both."""
+        group = np.arange(len(self.owners)) // self.size
+        probes, meets = np.zeros((2, len(self.met), self.people))
+        np.add.at(probes, (group, self.owners), 1)
+        meets[np.arange(len(self.met))[:, None], self.met] = 1
+        return probes, meets, (probes * meets).sum(axis=0)
+
+    def weighted_trials(self, weights: Array64) -> float:
+        """Weight of all trials under bootstrap weights of the people, (people,)."""
+        probes, meets, own = self._by_group
+        return float((probes @ weights) @ (meets @ weights) - own @ weights**2)
+
+    @cached_property
+    def person_pairs(self) -> int:
+        """Number of distinct pairs of people, in either order."""
+        compared, place = np.unique(self.met, return_inverse=True)
+        pairs = np.zeros((self.people, len(compared)), dtype=np.bool_)
+        for probes, columns in zip(self._by_group[0], place.reshape(self.met.shape), strict=True):
+            pairs[np.ix_(np.flatnonzero(probes), columns)] = True
+        pairs[compared, np.arange(len(compared))] = False
+        square = pairs[compared]
+        return int(np.count_nonzero(pairs) - np.count_nonzero(np.triu(square & square.T)))
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -1,6 +1,6 @@
 """Who is compared with whom in a calibration: enrollments, genuine probes, impostor pairs."""
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -13,6 +13,7 @@ from templates.space.embedding import normalised
 Indices = NDArray[np.int64]
 
 GROUP = 50
+"""Lifted probes that meet the same people."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -160,15 +161,17 @@ def chosen_photos(
 
 
 def impostor_groups(
-    plan: TrialPlan, probes: int, *, pairs: int, rng: np.random.Generator, size: int = GROUP
-) -> Iterator[tuple[slice, Indices]]:
-    """Split ``probes`` into groups, and draw for each the people it is compared with.
+    plan: TrialPlan, probes: int, *, pairs: int, rng: np.random.Generator
+) -> Indices:
+    """Draw for each group of ``GROUP`` probes the people it is compared with, (groups, W).
 
     A group meets all of its people, drawn without repetition, so that its comparisons are one
     matrix product; the next group meets others. Together about ``pairs`` comparisons. Those of a
     probe with its own person are among them, and are no impostor trials.
     """
     people_each = min(len(plan.compared), -(-pairs // probes))
-    for start in range(0, probes, size):
-        people = np.sort(rng.choice(plan.compared, size=people_each, replace=False))
-        yield slice(start, min(start + size, probes)), people.astype(np.int64)
+    groups = [
+        np.sort(rng.choice(plan.compared, size=people_each, replace=False))
+        for _ in range(0, probes, GROUP)
+    ]
+    return np.stack(groups).astype(np.int64)

@@ -24,7 +24,7 @@ from templates.contract.verdict import Verdict
 from templates.decoys import DecoyPool, DecoySource
 from templates.distances.blas import single_threaded
 from templates.space.lifting import Strategy, plain_strategy
-from verify import CalibrationOptions, CalibrationReport, LabelledFolder, calibrate, read_lfw_pairs
+from verify import CalibrationOptions, CalibrationReport, LabelledFolder, calibrate
 from verify.calibration import part_of
 from verify.comparisons import Progress
 from verify.group_rates import PhotoLabels
@@ -69,8 +69,7 @@ def calibrate_folder(
     """Calibrate on the embeddings of a labelled folder; judge privacy, accuracy and groups.
 
     ``source`` has all of its axes. ``axes`` and ``m`` that are None are chosen: what rejects the
-    fewest genuine probes of all that is private. LFW's own pairs are used for the ten-fold protocol
-    where ``pairs.txt`` lies in the folder.
+    fewest genuine probes of all that is private.
     """
     if not strategy.needs_decoys:
         raise PreparationError(
@@ -78,11 +77,6 @@ def calibrate_folder(
             "and no contract is made for it"
         )
     name_of = dict(zip(folder.paths, folder.identities, strict=True))
-    pairs_file = folder.root / "pairs.txt"
-    pairs = None
-    if options.protocol == "ten-fold" and pairs_file.is_file():
-        missing = [failure.path for failure in extraction.failures]
-        pairs = read_lfw_pairs(pairs_file, extraction.paths, missing=missing)
     names = [name_of[path] for path in extraction.paths]
     kept, staying = chosen_photos(names, exclude=exclude)
     if len(kept):
@@ -110,7 +104,6 @@ def calibrate_folder(
             options=replace(options, probe_dims=probe_dims),
             exclude=exclude,
             labels=labels,
-            pairs=pairs,
             recorded=recorded_of(pack),
             dataset=folder.root.resolve().name,
             progress=part_of(progress, SEARCHED, 1.0),

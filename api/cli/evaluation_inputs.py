@@ -4,7 +4,6 @@ import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 
-from api.cli.console import message
 from api.cli.descriptors import bulk_pack
 from api.cli.errors import CommandError, UsageError
 from api.service.opening import file_sealer, open_keyring
@@ -15,7 +14,7 @@ from templates.decoys.pool import POOL_MAGIC
 from verify.evaluation.embedding import Embedder, FileEmbedder, PackEmbedder
 from verify.evaluation.embeddings_file import read_embeddings
 from verify.evaluation.plan import RAW_FLIP
-from verify.evaluation.readers import notes, open_sets
+from verify.evaluation.readers import open_sets
 from verify.evaluation.sources import SourceFacts
 from verify.evaluation.verification_set import VerificationSet
 from verify.preparation import recorded_of, require_made_with
@@ -24,7 +23,7 @@ NO_PACK = "none"
 
 
 def open_all(datasets: Sequence[Path], *, pictures: bool) -> list[VerificationSet]:
-    """Open the sets, and say what is unusual in them."""
+    """Open the sets, whose names must differ."""
     sets = [pairs for path in datasets for pairs in open_sets(path, pictures=pictures)]
     names = [pairs.name for pairs in sets]
     if len(set(names)) < len(names):
@@ -32,9 +31,6 @@ def open_all(datasets: Sequence[Path], *, pictures: bool) -> list[VerificationSe
             f"two sets have one name ({', '.join(sorted(names))}), and rows are told apart by it: "
             "evaluate them one at a time, or rename a file"
         )
-    for pairs in sets:
-        for note in notes(pairs):
-            message(f"note: {note}")
     return sets
 
 

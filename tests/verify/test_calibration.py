@@ -9,7 +9,7 @@ from enroll import Enroller
 from templates.contract.document import Contract
 from templates.contract.nobody import Nobody
 from templates.decoys import client_source
-from templates.distances import Metric
+from templates.distances import DEFAULT_STEPS, Metric
 from templates.errors import ContractError, ContractMismatch, InvalidEmbedding
 from templates.keys.randomness import Keystream
 from templates.space.lifting import lift
@@ -27,9 +27,8 @@ from tests.verify.synthetic import (
 )
 from verify import Calibrated, CalibrationOptions, Verifier, calibrate
 from verify.calibration_mode import ACCURACY_LEVEL
-from verify.comparisons import Lifter, honest_norms, point_trials
-from verify.tenfold import Pair
-from verify.trials import enrolled_means, plan_trials, probe_sets
+from verify.comparisons import Comparison, Lifter, honest_norms
+from verify.trials import enrolled_means, plan_trials
 
 
 @pytest.mark.parametrize("most_templates", [None, 9])
@@ -46,27 +45,25 @@ def test_point_trials_agree_with_brute_force(most_templates: int | None) -> None
     means = enrolled_means(people.descriptors, plan)[compared]
     templates = lifter.lift(means, m=6, stream=stream)
     nobody = Nobody(source, lifter.strategy, 6, bytes(32))
-    impostors, genuine = point_trials(
-        people.descriptors,
-        plan,
-        templates,
-        nobody,
-        probe_sets(plan, 1, most=10**6, rng=rng),
-        metric=Metric.SPHERICAL,
-        consistency=1.0,
-        progress=lambda _what, _share: None,
-    )
     points = source.project(people.descriptors)
-    means, spreads = nobody.statistics(points, Metric.SPHERICAL)
+    comparison = Comparison(plan, templates, nobody, Metric.SPHERICAL, DEFAULT_STEPS)
+    expected = means, spreads = comparison.expected(points)
+    impostors = comparison.impostors(
+        points, expected, plan.person_of, plan.compared[None], size=len(points),
+        progress=lambda _share: None,
+    )  # fmt: skip
+    owners = plan.person_of[plan.genuine]
+    genuine = comparison.genuine(
+        points[plan.genuine], (means[plan.genuine], spreads[plan.genuine]), owners,
+        np.zeros(len(owners), dtype=bool),
+    )  # fmt: skip
 
     def score(photo: int, person: int) -> float:
         template = templates[compared.index(person)]
         close = spherical(points[photo], template)
         return float((close - means[photo]) / spreads[photo])
 
-    photos = np.concatenate(
-        [plan.genuine, np.setdiff1d(np.arange(len(people.names)), plan.genuine)]
-    )
+    photos = range(len(people.names))
     trials = {
         (photo, person): score(photo, person)
         for photo in photos
@@ -89,7 +86,6 @@ def test_point_trials_agree_with_brute_force(most_templates: int | None) -> None
     total = sum(weights[a] * weights[b] for a, b in seen)
     assert impostors.weighted_trials(weights) == pytest.approx(total)
     order = np.argsort(genuine.people, kind="stable")
-    owners = plan.person_of[plan.genuine]
     np.testing.assert_array_equal(genuine.people[order], np.sort(owners))
     for person in np.unique(owners):
         own = [score(photo, person) for photo in plan.genuine[owners == person]]
@@ -200,43 +196,6 @@ def test_ten_fold_adds_the_accuracy_level(people: People) -> None:
     assert folds.accuracy_mean > 0.95
     other = calibration.level("fmr-1e-2")
     assert (level.fmr.value < other.fmr.value) == (level.threshold > other.threshold)
-
-
-def ten_pairs(people: People) -> list[Pair]:
-    """Ten genuine pairs of the first ten people with two photos, and ten impostor pairs."""
-    photos = {name: people.names.index(name) for name in sorted(set(people.names))}
-    several = [first for name, first in photos.items() if people.names.count(name) > 1][:10]
-    return [Pair(first, first + 1, True, fold) for fold, first in enumerate(several)] + [
-        Pair(first, several[fold - 1], False, fold) for fold, first in enumerate(several)
-    ]
-
-
-def test_ten_fold_pairs_that_do_not_suffice_are_refused() -> None:
-    people = draw_people(30)
-    source = make_generator()
-    binding = make_binding(source.source_id)
-    options = CalibrationOptions(protocol="ten-fold", targets=(1e-1,))
-    pairs = ten_pairs(people)
-
-    def run(given: list[Pair] | None, *, exclude: set[str], names: list[str]) -> Calibrated:
-        return calibrate(
-            people.descriptors,
-            names,
-            binding=binding,
-            source=source,
-            options=options,
-            pairs=given,
-            exclude=exclude,
-        )
-
-    in_pairs = {people.names[pair.first] for pair in pairs}
-    with pytest.raises(ContractError, match="0 pairs are there: exclude fewer people"):
-        run(pairs, exclude=in_pairs, names=people.names)
-    with pytest.raises(ContractError, match="each of 10 folds"):
-        run(pairs[:9], exclude=set(), names=people.names)
-    alone = [f"{name}-{i}" if i > 1 else name for i, name in enumerate(people.names)]
-    with pytest.raises(ContractError, match="at least 10 pairs of photos of one person"):
-        run(None, exclude=set(), names=alone)
 
 
 def test_a_pool_contract_calibrates_and_its_clients_get_a_generator() -> None:

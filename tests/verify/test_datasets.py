@@ -2,9 +2,8 @@ from pathlib import Path
 
 import pytest
 
-from verify import DatasetError, labelled_folder, read_lfw_pairs
+from verify import DatasetError, labelled_folder
 from verify.datasets import distinct_files
-from verify.tenfold import FOLDS
 
 
 def make_folder(root: Path, photos: dict[str, int]) -> Path:
@@ -68,52 +67,3 @@ def test_what_is_no_labelled_folder_is_refused(tmp_path: Path, kind: str) -> Non
         root.mkdir()
     with pytest.raises(DatasetError, match="root/Person/photo"):
         labelled_folder(root)
-
-
-def pairs_text(*, separator: str = "\t") -> str:
-    fold = [separator.join(["Ann", "1", "2"]), separator.join(["Ann", "1", "Bob", "3"])]
-    return "\n".join([f"10{separator}1", *fold * FOLDS]) + "\n"
-
-
-@pytest.mark.parametrize("separator", ["\t", " "])
-def test_lfw_pairs_become_positions(tmp_path: Path, separator: str) -> None:
-    folder = labelled_folder(make_folder(tmp_path / "faces", {"Ann": 2, "Bob": 3}))
-    file = tmp_path / "pairs.txt"
-    file.write_text(pairs_text(separator=separator))
-    pairs = read_lfw_pairs(file, folder.paths)
-    assert len(pairs) == 2 * FOLDS
-    assert [pair.fold for pair in pairs] == [k // 2 for k in range(2 * FOLDS)]
-    assert (pairs[0].first, pairs[0].second, pairs[0].same) == (0, 1, True)
-    assert (pairs[1].first, pairs[1].second, pairs[1].same) == (0, 4, False)
-
-
-def test_pairs_of_photos_without_a_descriptor_are_left_out(tmp_path: Path) -> None:
-    folder = labelled_folder(make_folder(tmp_path / "faces", {"Ann": 2, "Bob": 3}))
-    file = tmp_path / "pairs.txt"
-    file.write_text(pairs_text())
-    found, failed = folder.paths[:4], folder.paths[4:]
-    pairs = read_lfw_pairs(file, found, missing=failed)
-    assert len(pairs) == FOLDS
-    assert all(pair.same for pair in pairs)
-    with pytest.raises(DatasetError, match="Bob/Bob_0003, which is not there"):
-        read_lfw_pairs(file, found)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("", "does not begin with"),
-        ("10\n", "does not begin with"),
-        ("ten\t300\n", "does not begin with"),
-        ("5\t1\n", "has 5 folds"),
-        ("10\t1\nAnn\t1\t2\n", "promises 20 pairs and holds 1"),
-        (pairs_text().replace("Ann\t1\t2", "Ann\t1", 1), "line 2 is not of the form Name i j"),
-        (pairs_text().replace("Bob\t3", "Bob\tx", 1), "line 3 is not of the form NameA"),
-    ],
-)
-def test_broken_pairs_are_refused_by_line(tmp_path: Path, text: str, message: str) -> None:
-    folder = labelled_folder(make_folder(tmp_path / "faces", {"Ann": 2, "Bob": 3}))
-    file = tmp_path / "pairs.txt"
-    file.write_text(text)
-    with pytest.raises(DatasetError, match=message):
-        read_lfw_pairs(file, folder.paths)

@@ -27,14 +27,8 @@ def all_against_all(scores: NDArray[np.float32]) -> Impostors:
     people = len(scores)
     cells = scores.copy()
     np.fill_diagonal(cells, -np.inf)
-    return Impostors(
-        scores=cells.reshape(-1),
-        trials=people * (people - 1),
-        people=people,
-        person_pairs=people * (people - 1) // 2,
-        people_of=lambda flat: np.stack([flat // people, flat % people], axis=1),
-        weighted_trials=lambda w: float(w.sum() ** 2 - w @ w),
-    )
+    everybody = np.arange(people)
+    return Impostors(cells, everybody, everybody[None], people, people)
 
 
 def by_hand(scores: NDArray[np.float32], members: NDArray[np.bool_]) -> NDArray[np.float64]:

@@ -18,18 +18,20 @@ from verify.thresholds import (
 )
 
 
-def impostors_of(
-    scores: NDArray[np.floating], *, trials: int | None = None, person_pairs: int = 10**9
-) -> Impostors:
-    count = int(np.isfinite(scores).sum())
-    return Impostors(
-        scores=np.asarray(scores, dtype=np.float32),
-        trials=count if trials is None else trials,
-        people=50,
-        person_pairs=person_pairs,
-        people_of=lambda flat: np.stack([flat % 50, (flat + 1) % 50], axis=1),
-        weighted_trials=lambda weights: float(weights.sum()) ** 2 * count / 50**2,
-    )
+def impostors_of(scores: NDArray[np.floating]) -> Impostors:
+    """Of one person's probes, a row each, with everybody else."""
+    cells = np.atleast_2d(scores).astype(np.float32)
+    met = np.arange(1, cells.shape[1] + 1)[None]
+    owners = np.zeros(len(cells), dtype=np.int64)
+    return Impostors(cells, owners, met, len(cells), people=met.size + 1)
+
+
+def all_of(people: int) -> Impostors:
+    """One probe of each person with everybody else, by chance."""
+    everybody = np.arange(people)
+    cells = np.random.default_rng(0).normal(size=(people, people)).astype(np.float32)
+    np.fill_diagonal(cells, -np.inf)
+    return Impostors(cells, everybody, everybody[None], people, people)
 
 
 @given(
@@ -51,32 +53,21 @@ def test_the_highest_scores_set_the_thresholds_of_all(
 
 
 def test_levels_are_refused_that_the_data_cannot_resolve() -> None:
-    scores = np.zeros(9_999)
-    kept, refused = resolved_targets(impostors_of(scores), [1e-3, 1e-2])
+    kept, refused = resolved_targets(all_of(100), [1e-3, 1e-2])
     assert kept == [1e-2]
-    assert "FMR 0.001 is not resolved by 9999 impostor trials" in refused[0]
-    few_pairs = impostors_of(scores, trials=10**6, person_pairs=2_999)
-    assert resolved_targets(few_pairs, [1e-2, 1e-3])[0] == [1e-2]
+    assert "FMR 0.001 is not resolved by 9900 impostor trials of 4950 pairs" in refused[0]
+    few_pairs = impostors_of(np.zeros((400, 2_999)))
+    assert (few_pairs.trials, few_pairs.person_pairs) == (400 * 2_999, 2_999)
+    assert "of 2999 pairs of people" in resolved_targets(few_pairs, [1e-3])[1][0]
 
 
 def test_a_threshold_that_one_person_decides_does_not_hold_when_set_anew() -> None:
     """Of 50 people, one near everybody: a third of the resamples have another threshold."""
-    pairs = np.array([(i, j) for i in range(50) for j in range(50) if i != j])
-    scores = np.random.default_rng(0).normal(size=len(pairs)).astype(np.float32)
-
-    def bound(values: NDArray[np.float32]) -> float:
-        impostors = Impostors(
-            scores=values,
-            trials=len(pairs),
-            people=50,
-            person_pairs=len(pairs) // 2,
-            people_of=lambda flat: pairs[flat],
-            weighted_trials=lambda weights: float(weights.sum() ** 2 - weights @ weights),
-        )
-        return bound_when_set_anew(impostors, 0.02)
-
-    assert 0.02 < bound(scores) < 0.04
-    assert bound(np.where((pairs == 0).any(axis=1), scores + 9, scores)) > 0.04
+    impostors = all_of(50)
+    assert 0.02 < bound_when_set_anew(impostors, 0.02) < 0.04
+    impostors.cells[0] += 9
+    impostors.cells[:, 0] += 9
+    assert bound_when_set_anew(impostors, 0.02) > 0.04
 
 
 def test_probes_that_are_refused_count_for_the_frr_only() -> None:

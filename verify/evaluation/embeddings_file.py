@@ -8,12 +8,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from verify.datasets import SUFFIXES, DatasetError, faults_in
+from verify.datasets import SUFFIXES, DatasetError
 from verify.evaluation.readers.reader import isolated
 from verify.evaluation.verification_set import VerificationSet
 
 _NAMES = ("paths", "descriptors")
-_SHOWN = 3
 _FLOATS = (np.dtype(np.float16), np.dtype(np.float32), np.dtype(np.float64))
 _KEYS = "expected arrays paths (unicode) and descriptors (float16, float32 or float64)"
 
@@ -102,21 +101,21 @@ def match(file: EmbeddingsFile, benchmark: VerificationSet) -> NDArray[np.int64]
     telling = _TELLING.get(benchmark.kind)
     taken: dict[int, str] = {}
     positions = np.full(len(benchmark.pictures), -1, dtype=np.int64)
-    faults: list[str] = []
     for place, picture in enumerate(benchmark.pictures):
         pieces = _components(picture.name)
         rows = exact.get(picture.name) or ends[pieces if telling is None else pieces[-telling:]]
         if len(rows) > 1:
-            shown = " and ".join(f"{file.paths[row]!a}" for row in rows[:_SHOWN])
-            faults.append(f"{picture.name} may be {shown}")
-        elif rows and taken.setdefault(rows[0], picture.name) != picture.name:
-            faults.append(f"{file.paths[rows[0]]!a} fits {taken[rows[0]]} and {picture.name}")
-        elif rows:
+            raise DatasetError(
+                f"{benchmark.name}: the embedding of {picture.name} may be "
+                f"{file.paths[rows[0]]!a} or {file.paths[rows[1]]!a}"
+            )
+        if rows and taken.setdefault(rows[0], picture.name) != picture.name:
+            raise DatasetError(
+                f"{benchmark.name}: {file.paths[rows[0]]!a} fits {taken[rows[0]]} and "
+                f"{picture.name}"
+            )
+        if rows:
             positions[place] = rows[0]
-    if faults:
-        raise DatasetError(
-            faults_in(Path(benchmark.name), "expected one embedding for each photo", faults)
-        )
     return positions
 
 

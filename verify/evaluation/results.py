@@ -18,7 +18,6 @@ from verify.evaluation.intervals import fmr_grid, percentiles
 from verify.evaluation.labels_file import Labels
 from verify.evaluation.plan import EvaluationPlan, Json
 from verify.evaluation.provenance import Model, software
-from verify.evaluation.readers import notes
 from verify.evaluation.sources import SourceFacts
 from verify.metrics import resolvable, wilson
 from verify.tenfold import FOLDS
@@ -97,7 +96,6 @@ def _dataset(result: SetResult) -> Json:
         "failed_impostor": trials.failed_impostor,
         "fta": trials.fta,
         "decoys": [{**source.json(), "left_out": source.left_out} for source in result.sources],
-        "notes": notes(pairs),
     }
 
 

@@ -180,7 +180,6 @@ def _dataset(dataset: Row, rows: Sequence[Row]) -> list[str]:
         for decoys in dataset["decoys"]
         if decoys["left_out"]
     ]
-    lines += [f"Note: {plain(note)}" for note in dataset["notes"]]
     failures = dataset["failures"]
     if not failures:
         return [*lines, "Failures to acquire: none."]

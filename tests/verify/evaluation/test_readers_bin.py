@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from tests.verify.evaluation.layouts import bin_content, drawn
 from verify import DatasetError
-from verify.evaluation.readers import notes, open_sets
+from verify.evaluation.readers import open_sets
 from verify.evaluation.verification_set import VerificationSet
 from verify.tenfold import FOLDS
 
@@ -156,15 +156,3 @@ def test_random_files_only_ever_raise_dataset_errors(
     file.write_bytes(data)
     with pytest.raises(DatasetError):
         open_sets(file)
-
-
-def test_notes_of_unusual_sets(tmp_path: Path) -> None:
-    bins, same = bin_content(2 * FOLDS + 1)
-    bins[1] = bins[0]
-    bins[4:6] = bins[3], bins[2]
-    found = notes(read(tmp_path / "mine.bin", (bins, same)))
-    assert found == [
-        "mine: folds differ in their numbers of genuine or impostor pairs (2 to 3 pairs a fold)",
-        "mine: 1 pair compares a photo with itself",
-        "mine: 1 pair compares the same two photos as another pair",
-    ]

@@ -7,7 +7,6 @@ import pytest
 import scipy.io
 
 from tests.verify.evaluation.layouts import (
-    AGEDB_NAMES,
     agedb_folder,
     agedb_folds,
     agedb_splits,
@@ -15,8 +14,8 @@ from tests.verify.evaluation.layouts import (
     lfw_folder,
     write,
 )
-from verify import DatasetError, labelled_folder, read_lfw_pairs
-from verify.evaluation.readers import notes, open_sets
+from verify import DatasetError
+from verify.evaluation.readers import open_sets
 from verify.evaluation.readers.agedb import PROTOCOL, read_content
 from verify.evaluation.verification_set import VerificationSet
 from verify.tenfold import FOLDS
@@ -49,22 +48,19 @@ def test_lfw(tmp_path: Path, inside: str, suffix: str) -> None:
     assert lfw.people == ("Ann", "Ann", "Bob")
     assert (lfw.name, lfw.kind, lfw.aligned) == ("lfw", "lfw", None)
     assert lfw.pictures[2].read() == (tmp_path / inside / bob).read_bytes()
-    assert notes(lfw)[0] == "lfw has 20 pairs, the published set has 6,000"
 
 
 def test_lfw_without_photos(tmp_path: Path) -> None:
     lfw_folder(tmp_path, photos=False)
     (lfw,) = open_sets(tmp_path, pictures=False)
     assert lfw.pictures[0].name == "Ann/Ann_0001.jpg"
-    with pytest.raises(DatasetError, match=r"3 faults.*Ann/Ann_0001 is not there"):
+    with pytest.raises(DatasetError, match=r"photo Ann/Ann_0001 of pairs\.txt is not there"):
         open_sets(tmp_path)
 
 
-def test_lfw_lists_absent_and_doubled_photos(tmp_path: Path) -> None:
-    lfw_folder(tmp_path)
-    (tmp_path / "Ann/Ann_0002.jpg").unlink()
-    write(tmp_path / "Bob/Bob_0001.png", b"x")
-    with pytest.raises(DatasetError, match=r"Ann_0002 is not there; Bob/Bob_0001 is there 2 times"):
+def test_a_photo_that_is_there_twice_is_refused(tmp_path: Path) -> None:
+    write(lfw_folder(tmp_path) / "Bob/Bob_0001.png", b"x")
+    with pytest.raises(DatasetError, match=r"Bob/Bob_0001 of pairs\.txt is there 2 times"):
         open_sets(tmp_path)
 
 
@@ -72,7 +68,11 @@ def test_lfw_lists_absent_and_doubled_photos(tmp_path: Path) -> None:
     ("old", "new", "message"),
     [
         ("10\t1", "9\t1", "has 9 folds"),
-        ("Bob\t1", "../Bob\t1", "expected plain names"),
+        ("10\t1", "10", "does not begin with"),
+        ("10\t1", "10\t2", "promises 40 pairs and holds 20"),
+        ("Ann\t1\t2", "Ann\t1", "line 2 is not of the form Name i j"),
+        ("Bob\t1", "Bob\tx", "line 3 is not of the form NameA"),
+        ("Bob\t1", "../Bob\t1", "no plain name"),
     ],
 )
 def test_lfw_broken_protocols(tmp_path: Path, old: str, new: str, message: str) -> None:
@@ -84,13 +84,7 @@ def test_lfw_broken_protocols(tmp_path: Path, old: str, new: str, message: str) 
 
 def test_real_lfw(lfw_aligned: Path) -> None:
     (lfw,) = open_sets(lfw_aligned)
-    folder = labelled_folder(lfw_aligned)
-    truth = read_lfw_pairs(lfw_aligned / "pairs.txt", folder.paths)
-    names = [path.relative_to(lfw_aligned).as_posix() for path in folder.paths]
-    assert pairs_of(lfw) == [(names[p.first], names[p.second], p.same, p.fold) for p in truth]
     assert (len(lfw), len(lfw.pictures), lfw.genuine) == (6000, 7701, 3000)
-    # The published protocol compares one pair of photos twice.
-    assert all("the same two photos" in note for note in notes(lfw))
 
 
 # CFP
@@ -176,22 +170,6 @@ def test_agedb(tmp_path: Path, layout: str, compressed: bool) -> None:
     assert pairs_of(agedb) == expected
     assert (agedb.name, agedb.kind) == ("agedb_30", "agedb")
     assert agedb.people == ("AnnBell", "AnnBell", "BobHay")
-    assert notes(agedb)[0] == "agedb_30 has 30 pairs, the published set has 6,000"
-
-
-def test_agedb_labels_that_contradict_the_names_are_noted(tmp_path: Path) -> None:
-    folds = agedb_folds()
-    folds[4] = [(first, second, -label) for first, second, label in folds[4]]
-    (agedb,) = open_sets(agedb_folder(tmp_path, folds=folds))
-    assert "agedb_30: 3 pairs compare people whose names contradict the label" in notes(agedb)
-
-
-def test_agedb_absent_photos_are_listed(tmp_path: Path) -> None:
-    agedb_folder(tmp_path)
-    for name in AGEDB_NAMES[1:]:
-        (tmp_path / "03_Protocol_Images" / f"{name}.jpg").unlink()
-    with pytest.raises(DatasetError, match=rf"{AGEDB_NAMES[1]} is not there; {AGEDB_NAMES[2]} is"):
-        open_sets(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -201,7 +179,7 @@ def test_agedb_absent_photos_are_listed(tmp_path: Path) -> None:
         ([("a", "b", 5), ("a", "c", 1)], "fold 10 .*other labels"),
         ([("a", "b", 0), ("a", "b", -1), ("a", "a", 1)], "fold 10 .*other labels"),
         ([("a", " ", -1), ("a", "a", 1)], "fold 10 .*photo without a name"),
-        ([("a/b", "c", 1), ("a", "c", -1)], "expected plain names"),
+        ([("a/b", "c", 1), ("a", "c", -1)], "no plain name"),
     ],
 )
 def test_agedb_wrong_protocols(

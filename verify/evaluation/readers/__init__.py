@@ -5,11 +5,8 @@ from importlib import import_module
 from pathlib import Path
 
 from verify.datasets import DatasetError
-from verify.evaluation.readers.notes import notes
 from verify.evaluation.readers.reader import Reader
 from verify.evaluation.verification_set import VerificationSet
-
-__all__ = ["notes", "open_sets"]
 
 
 def _readers() -> list[Reader]:

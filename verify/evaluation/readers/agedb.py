@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 
 from models.extraction import Photo
-from verify.datasets import SUFFIXES, DatasetError, Trial, read_whole
+from verify.datasets import SUFFIXES, DatasetError, read_whole
 from verify.evaluation.readers.reader import (
     Reader,
+    Trial,
     assemble,
     isolated,
     keys_of,

@@ -5,10 +5,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from models.extraction import Photo
-from verify.datasets import DatasetError, Trial, faults_in
+from verify.datasets import DatasetError
 from verify.evaluation.readers.reader import (
     ProtocolText,
     Reader,
+    Trial,
     assemble,
     keys_of,
     read_text,
@@ -35,9 +36,9 @@ def read_cfp(root: Path, pictures: bool) -> list[VerificationSet]:
     lists = {letter: _photo_list(text, letter) for letter, text in texts.items()}
     protocols = {split: _trials(root, split, lists) for split in ("FF", "FP")}
     keys = keys_of(trial for trials, _ in protocols.values() for trial in trials)
-    absent = [f"{key} is not there" for key in keys if pictures and not (root / key).is_file()]
-    if absent:
-        raise DatasetError(faults_in(root, "expected each photo of the protocol", absent))
+    for key in keys if pictures else ():
+        if not (root / key).is_file():
+            raise DatasetError(f"{root}: the photo {key} of the protocol is not there")
     return [
         assemble(
             f"cfp_{split.lower()}",

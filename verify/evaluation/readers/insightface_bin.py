@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from models.extraction import Photo
-from verify.datasets import DatasetError, Trial, read_whole
-from verify.evaluation.readers.reader import Reader, assemble, isolated
+from verify.datasets import DatasetError, read_whole
+from verify.evaluation.readers.reader import Reader, Trial, assemble, isolated
 from verify.evaluation.verification_set import (
     VerificationSet,
     contiguous_folds,

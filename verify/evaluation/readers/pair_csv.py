@@ -6,8 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from models.extraction import Photo
-from verify.datasets import DatasetError, Trial, csv_rows, faults_in, is_photo, visible
-from verify.evaluation.readers.reader import Reader, assemble, keys_of, read_text
+from verify.datasets import DatasetError, csv_rows, is_photo, visible
+from verify.evaluation.readers.reader import Reader, Trial, assemble, keys_of, read_text
 from verify.evaluation.verification_set import VerificationSet
 from verify.tenfold import FOLDS
 
@@ -50,13 +50,10 @@ def read_pair_csv(path: Path, pictures: bool) -> list[VerificationSet]:
         if folder.is_dir():
             photos = [file for file in visible(folder) if is_photo(file)]
             templates[name] = [Photo(f"{name}/{file.name}", file) for file in photos]
-    absent = [
-        f"{name} is not there" if name not in templates else f"{name} holds no photo"
-        for name in keys_of(trials)
-        if pictures and not templates.get(name) and not Path(_place(path, name)).is_file()
-    ]
-    if absent:
-        raise DatasetError(faults_in(path, "expected the photos that it names", absent))
+            if not photos:
+                raise DatasetError(f"{path}: the folder {name} holds no photo")
+        elif pictures and not folder.is_file():
+            raise DatasetError(f"{path}: the photo {name} is not there")
     return [
         assemble(
             path.stem,

@@ -21,9 +21,7 @@ from verify.datasets import (
     MAX_PAIRS_BYTES,
     SUFFIXES,
     DatasetError,
-    Trial,
     decoded,
-    faults_in,
     is_photo,
     read_whole,
 )
@@ -49,6 +47,16 @@ class Reader:
     recognises: Callable[[Path], bool]
     # The second argument says whether the photos must be there.
     read: Callable[[Path, bool], list[VerificationSet]]
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One comparison of a protocol; photos by a key that is unique in the set."""
+
+    first: str
+    second: str
+    same: bool
+    fold: int | None = None
 
 
 @dataclass(frozen=True)
@@ -102,7 +110,6 @@ def photos_named(base: Path, keys: Sequence[str], *, protocol: str) -> dict[str,
     """Find the one photo of each key, which is its path below ``base`` without the suffix."""
     listed: dict[Path, dict[str, list[Path]]] = {}
     photos: dict[str, Path] = {}
-    faults: list[str] = []
     for key in keys:
         folder, stem = (base / key).parent, Path(key).name
         if folder not in listed:
@@ -114,26 +121,23 @@ def photos_named(base: Path, keys: Sequence[str], *, protocol: str) -> dict[str,
             case [photo]:
                 photos[key] = photo
             case []:
-                faults.append(f"{key} is not there")
+                raise DatasetError(
+                    f"{base}: the photo {key} of {protocol} is not there; a photo ends in "
+                    f"{', '.join(sorted(SUFFIXES))}"
+                )
             case several:
-                faults.append(f"{key} is there {len(several)} times with different suffixes")
-    if faults:
-        suffixes = ", ".join(sorted(SUFFIXES))
-        raise DatasetError(
-            faults_in(base, f"expected the photos that {protocol} names ({suffixes})", faults)
-        )
+                raise DatasetError(
+                    f"{base}: the photo {key} of {protocol} is there {len(several)} times, with "
+                    "different suffixes"
+                )
     return photos
 
 
 def require_plain_names(file: Path, names: Iterable[str]) -> None:
     """Refuse names that lead out of the folder of the photos."""
-    unsafe = sorted(
-        f"{name!a}"
-        for name in set(names)
-        if not name.isprintable() or "/" in name or "\\" in name or name in (".", "..")
-    )
-    if unsafe:
-        raise DatasetError(faults_in(file, "expected plain names", unsafe))
+    for name in names:
+        if not name.isprintable() or "/" in name or "\\" in name or name in (".", ".."):
+            raise DatasetError(f"{file}: {name!a} is no plain name of a photo")
 
 
 def assemble(
