@@ -1,8 +1,7 @@
 """Model packs: user-supplied weights that together turn a photo into an embedding."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, TypedDict, Unpack
 
@@ -81,10 +80,10 @@ class ModelPack:
         *,
         embedder: Embedder,
         detector: Detector | None,
-        liveness: Callable[[], PassiveLiveness | None] = lambda: None,
+        liveness: PassiveLiveness | None = None,
     ) -> None:
         self.info = info
-        self._open_liveness = liveness
+        self.liveness = liveness
         self._embedder = embedder
         self._detector = detector
         self._demo = (
@@ -148,22 +147,13 @@ class ModelPack:
             preprocessing=embedder.preprocessing.as_dict(),
             detector=detector_info,
         )
-        liveness = partial(
-            open_liveness,
+        liveness = open_liveness(
             [graph for graph in graphs if graph.role is Role.LIVENESS],
             stated,
             location.folder,
             detects=detector is not None,
         )
         return cls(info, embedder=embedder, detector=detector, liveness=liveness)
-
-    @cached_property
-    def liveness(self) -> PassiveLiveness | None:
-        """The liveness graphs, tried when they are first asked for; ``None`` where none are.
-
-        A pack whose liveness nobody asks for works all the same where they cannot be used.
-        """
-        return self._open_liveness()
 
     @property
     def crop_size(self) -> int:

@@ -19,7 +19,6 @@
     channel_order = "bgr"    # or "rgb"
     input_range = [0, 255]   # what the pixel values 0 and 255 become
     live_class = 1
-    score = "softmax"        # or "difference", of two logits
 
 Every key but ``file`` is optional; an unknown one is an error.
 """
@@ -37,6 +36,7 @@ _MAX_BYTES = 64 * 1024
 
 Number = Annotated[float, Field(gt=-1e6, lt=1e6)]
 ChannelOrder = Literal["rgb", "bgr"]
+CropShape = Literal["box", "square"]
 
 
 def _per_channel(value: Any) -> Any:
@@ -65,7 +65,7 @@ Range = Annotated[
 
 
 class _Table(BaseModel):
-    """A value is ``None`` where the file is silent."""
+    """A table of the file. A value is ``None`` where only the graph can tell."""
 
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -86,16 +86,15 @@ class DetectorStatement(_Table):
 
 
 class LivenessStatement(_Table):
-    """What is stated of one liveness graph."""
+    """What is stated of one liveness graph; the defaults are those of MiniFASNet."""
 
     file: Annotated[str, Field(min_length=1)]
     crop_scale: Annotated[float, Field(ge=0.5, le=8)] | None = None
-    crop: Literal["box", "square"] | None = None
+    crop: CropShape = "box"
     input_size: Annotated[int, Field(ge=16, le=2048)] | None = None
-    channel_order: ChannelOrder | None = None
-    input_range: Range | None = None
-    live_class: Annotated[int, Field(ge=0, le=15)] | None = None
-    score: Literal["softmax", "difference"] | None = None
+    channel_order: ChannelOrder = "bgr"
+    input_range: Range = (0.0, 255.0)
+    live_class: Annotated[int, Field(ge=0, le=15)] = 1
 
 
 class PackFile(_Table):

@@ -202,6 +202,6 @@ def add_liveness(pack: Path) -> Path:
     onnx.save(model, pack / "light.onnx")
     (pack / "pack.toml").write_text(
         '[[liveness]]\nfile = "light.onnx"\ncrop_scale = 2.7\ncrop = "square"\n'
-        'channel_order = "rgb"\ninput_range = [0, 1]\nlive_class = 0\nscore = "difference"\n'
+        'channel_order = "rgb"\ninput_range = [0, 1]\nlive_class = 0\n'
     )
     return pack

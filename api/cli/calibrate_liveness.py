@@ -11,7 +11,6 @@ from api.cli.results import Result, Table
 from api.cli.verdict import shown_rate
 from api.service.opening import file_sealer, open_keyring
 from api.settings import Settings
-from models.errors import PackError
 from models.pack import ModelPack
 from templates.contract.document import Contract
 from templates.errors import VeilfaceError
@@ -77,13 +76,11 @@ def with_liveness_of(file: Path, contract: Contract, pack: ModelPack, sealer: Se
         return contract
     try:
         liveness = Contract.load(file, sealer).liveness
-        graphs = None if liveness is None else pack.liveness
-    except (VeilfaceError, PackError):
-        # An older format, another master key, or graphs that cannot be used: it is replaced.
+    except VeilfaceError:  # another format or another master key: it is replaced
         return contract
     if liveness is None:
         return contract
-    if graphs is None or liveness.graphs != graphs.graphs:
+    if pack.liveness is None or liveness.graphs != pack.liveness.graphs:
         message(
             f"The liveness threshold of {file} is dropped: the pack has other liveness graphs. Run "
             "`veilface calibrate --liveness`."

@@ -12,7 +12,7 @@ from api.cli.console import counted, demo_notice, message
 from api.cli.errors import CommandError, UsageError
 from api.cli.pack_download import obtained, shown
 from api.cli.results import Result, Table, reports
-from models.errors import ModelError, PackError
+from models.errors import ModelError
 from models.known_packs import KNOWN_PACKS
 from models.liveness import LivenessGraph
 from models.pack import ModelPack, PackInfo
@@ -122,7 +122,6 @@ def fetch(
 
 def _described(pack: ModelPack) -> dict[str, object]:
     info = pack.info
-    graphs, refusal = _liveness_graphs(pack)
     return {
         "name": info.name,
         "n": info.n,
@@ -130,17 +129,12 @@ def _described(pack: ModelPack) -> dict[str, object]:
         "embedder_sha256": info.embedder_sha256,
         "preprocessing": info.preprocessing,
         "detector": None if info.detector is None else info.detector.kind,
-        "liveness": [graph.as_dict() for graph in graphs],
-        "liveness_reason": refusal,
+        "liveness": [graph.as_dict() for graph in _liveness_graphs(pack)],
     }
 
 
-def _liveness_graphs(pack: ModelPack) -> tuple[Sequence[LivenessGraph], str | None]:
-    """Liveness graphs, or why they cannot be used: the pack can be, without them."""
-    try:
-        return (() if pack.liveness is None else pack.liveness.members), None
-    except PackError as error:
-        return (), str(error)
+def _liveness_graphs(pack: ModelPack) -> Sequence[LivenessGraph]:
+    return () if pack.liveness is None else pack.liveness.members
 
 
 def usable(info: PackInfo) -> str:
@@ -186,16 +180,12 @@ def inspect(
     else:
         demo_notice(loaded.info.embedder_sha256, n=loaded.info.n)
         text.append(f"Usable: {usable(loaded.info)}")
-        members, unusable = _liveness_graphs(loaded)
-        if unusable is not None:
-            text.append(f"Its liveness graphs cannot be used: {unusable}")
-        for member in members:
-            fed = member.expects
-            text.append(
-                f"Liveness: {member.file}, {fed.crop} of the face times {fed.crop_scale:g}, "
-                f"{fed.size} x {fed.size} {fed.channel_order.upper()}, class {fed.live_class} "
-                f"is live, score {fed.score}."
-            )
+        text += [
+            f"Liveness: {graph.file}, {graph.stated.crop} of the face times {graph.crop_scale:g}, "
+            f"{graph.size} x {graph.size} {graph.stated.channel_order.upper()}, class "
+            f"{graph.stated.live_class} is live."
+            for graph in _liveness_graphs(loaded)
+        ]
     names = ("file", "role", "reason", "sha256", "inputs", "outputs")
     facts = {
         "usable": loaded is not None,

@@ -2,7 +2,6 @@
 
 from api.http.errors import ApiError, StartError
 from api.settings import LivenessPolicy
-from models.errors import PackError
 from models.pack import ModelPack
 from templates.contract.document import Contract, Level
 from templates.errors import Uncalibrated
@@ -71,8 +70,7 @@ def _rate(level: Level) -> float:
 class LivenessRules:
     """The liveness policy of a deployment, which binds every caller.
 
-    A policy that asks for what contract and pack cannot tell is a `StartError`. The liveness graphs
-    are loaded only where the policy asks.
+    A policy that asks for what contract and pack cannot tell is a `StartError`.
     """
 
     def __init__(self, policy: LivenessPolicy, contract: Contract, pack: ModelPack | None) -> None:
@@ -117,19 +115,19 @@ _NO_DETECTOR = (
 
 
 def _lacking_passive(contract: Contract, pack: ModelPack | None) -> str | None:
+    graphs = None if pack is None else pack.liveness
+    if graphs is None:
+        return (
+            "the model pack has no liveness graph, which passive needs: add one to its folder "
+            "(docs/liveness.md), or choose active or off"
+        )
+    if contract.liveness is None:
+        return (
+            "the contract has no liveness threshold, which passive needs: run `veilface "
+            "calibrate --liveness`, or choose active or off"
+        )
     try:
-        graphs = None if pack is None else pack.liveness
-        if graphs is None:
-            return (
-                "the model pack has no liveness graph, which passive needs: add one to its folder "
-                "(docs/liveness.md), or choose active or off"
-            )
-        if contract.liveness is None:
-            return (
-                "the contract has no liveness threshold, which passive needs: run `veilface "
-                "calibrate --liveness`, or choose active or off"
-            )
         contract.liveness.require_graphs(graphs.graphs)
-    except (PackError, Uncalibrated) as error:
+    except Uncalibrated as error:
         return str(error)
     return None

@@ -28,7 +28,7 @@ def calibrated(folder: Path, **changes: Any) -> Deployment:
     contract = replace(
         deployment.contract,
         liveness=LivenessCalibration(
-            graphs=graphs.graphs, threshold=0.0, bpcer=RATE, target_bpcer=0.01
+            graphs=graphs.graphs, threshold=0.5, bpcer=RATE, target_bpcer=0.01
         ),
     )
     settings = deployment.settings

@@ -70,7 +70,6 @@ def test_what_is_stated_and_what_is_not(tmp_path):
         ("[[liveness]]\nfile = 'a'\ninput_range = 1", "liveness.0.input_range"),
         ("[[liveness]]\nfile = 'a'\nlive_class = -1", "equal to 0"),
         ("[[liveness]]\nfile = 'a'\nlive_class = true", "valid integer"),
-        ("[[liveness]]\nfile = 'a'\nscore = 'argmax'", "'softmax' or 'difference'"),
         ("# " + "x" * 70_000, "not a pack.toml"),
     ],
 )

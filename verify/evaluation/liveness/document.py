@@ -173,7 +173,7 @@ def _provenance(results: Json) -> str:
     lines = [f"Model pack: {plain(model.get('pack'))}"]
     lines += [
         f"Liveness graph: {code(graph['file'])}, crop {graph['crop']} × {graph['crop_scale']:g}, "
-        f"score {graph['score']}, SHA-256 {graph['sha256'][:12]}"
+        f"SHA-256 {graph['sha256'][:12]}"
         for graph in model["liveness"]
     ]
     attacks = ", ".join(
