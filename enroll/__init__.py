@@ -1,14 +1,5 @@
-"""From photos, or a client's template, to the one private template of a subject.
-
-Imports the layer below only: ``templates`` and ``models``.
-"""
+"""From photos, or a client's template, to the one private template of a subject."""
 
 from enroll.enroller import Enroller, Enrollment, Holder
-from enroll.public_contract import PublicContract
 
-__all__ = [
-    "Enroller",
-    "Enrollment",
-    "Holder",
-    "PublicContract",
-]
+__all__ = ["Enroller", "Enrollment", "Holder"]

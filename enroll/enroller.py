@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.pack import ModelPack
-from models.quality import DEFAULT_QUALITY, Quality, QualityLimits
+from models.quality import Quality
 from models.selection import FacePolicy
 from templates.contract import wire
 from templates.contract.document import Contract
 from templates.decoys import Attributes, DecoySource
-from templates.errors import ContractMismatch, InvalidTemplate
+from templates.errors import InvalidTemplate
 from templates.keys.randomness import Keystream
 from templates.keys.rotation import HolderKey, TenantRotation, holder_rotation
 from templates.space.agreement import distinct_rows, mean_embedding
@@ -52,19 +52,19 @@ class Enrollment:
         Rotated template in the wire format. Private: to be sealed, never logged.
     template_id
         Random, 32 hexadecimal digits; its rotation is derived from it.
-    qualities
-        Of each photo; None for an embedding, and empty for a client's template.
-    photos
-        How many different photos were averaged: one that is given twice counts once.
     holder_salt
         The holder's rotation is derived from it and their key. None where it needs no key.
+    qualities
+        Of each photo; empty where there were none.
+    photos
+        How many different photos were averaged: one that is given twice counts once.
     """
 
     wire: bytes = field(repr=False)
     template_id: str
     contract_id: str
     holder_salt: str | None = None
-    qualities: tuple[Quality | None, ...] = ()
+    qualities: tuple[Quality, ...] = ()
     photos: int = 0
 
 
@@ -74,16 +74,11 @@ class Enroller:
     Parameters
     ----------
     source
-        The contract's decoys.
+        The contract's decoys, reduced to its axes; others are a ContractMismatch.
     rotation
         What gives each template of the tenant its rotation.
     lift_secret
         32 secret bytes of the deployment, which decoys are drawn under.
-
-    Raises
-    ------
-    ContractMismatch
-        Where the source or the rotation is not the contract's.
     """
 
     def __init__(
@@ -94,12 +89,6 @@ class Enroller:
         rotation: TenantRotation,
         lift_secret: bytes,
     ) -> None:
-        binding = contract.binding
-        if (source.n, source.k, rotation.n) != (binding.n, binding.axes, binding.axes):
-            raise ContractMismatch(
-                f"the contract is for {binding.n} numbers on {binding.axes} axes; the decoy source "
-                f"has {source.n} and {source.k}, the rotation turns {rotation.n}"
-            )
         self._contract = contract
         self._source = source
         self._rotation = rotation
@@ -114,34 +103,29 @@ class Enroller:
         attributes: Attributes | None = None,
         holder: Holder | None = None,
         policy: FacePolicy = FacePolicy.DOMINANT,
-        quality: QualityLimits | None = DEFAULT_QUALITY,
     ) -> Enrollment:
-        """Enroll from 1 to 10 photo files; parameters as in `from_embeddings` and `PhotoOptions`.
+        """Enroll from 1 to 10 photo files; as :meth:`from_embeddings`.
+
+        Parameters
+        ----------
+        pack
+            The contract's.
+        policy
+            Which face is meant in a photo of several.
 
         Raises
         ------
-        ContractMismatch
-            Where the pack is not the contract's.
         PhotoRejected
             Where one photo has no usable face; nothing is enrolled then.
-        InconsistentImages
-            Where the photos do not show one person.
         """
-        info = pack.info
-        self._contract.binding.require_embedder(
-            embedder_sha256=info.embedder_sha256, preprocessing=info.preprocessing, n=info.n
-        )
-        if not 1 <= len(photos) <= MAX_PHOTOS:
-            raise ValueError(f"an enrollment has 1 to {MAX_PHOTOS} photos, not {len(photos)}")
-        samples = pack.embed_photos(photos, policy=policy, quality=quality, digested=True)
-        embeddings = np.stack([sample.embedding for sample in samples])
-        return self._lifted(
-            unit_rows(embeddings, n=info.n, most=MAX_PHOTOS),
+        samples = pack.embed_photos(photos, policy=policy, digested=True)
+        enrollment = self._lifted(
+            np.stack([sample.embedding for sample in samples]),
             [cast("bytes", sample.picture) for sample in samples],
             attributes,
             holder,
-            [sample.quality for sample in samples],
         )
+        return replace(enrollment, qualities=tuple(sample.quality for sample in samples))
 
     def from_embeddings(
         self,
@@ -167,8 +151,7 @@ class Enroller:
             Where the embeddings part into two groups less alike than ``photo_consistency``.
         """
         rows = unit_rows(embeddings, n=self._contract.binding.n, most=MAX_PHOTOS)
-        photos = [row.tobytes() for row in rows]
-        return self._lifted(rows, photos, attributes, holder, [None] * len(rows))
+        return self._lifted(rows, [row.tobytes() for row in rows], attributes, holder)
 
     def _lifted(
         self,
@@ -176,11 +159,11 @@ class Enroller:
         photos: Sequence[bytes],
         attributes: Attributes | None,
         holder: Holder | None,
-        qualities: Sequence[Quality | None],
     ) -> Enrollment:
+        """Lift the mean of unit rows; ``photos`` are what decides the decoys."""
         contract, binding = self._contract, self._contract.binding
-        descriptor = mean_embedding(rows, consistency=contract.photo_consistency)
-        named = [attributes or Attributes()] if binding.strategy is Strategy.HYBRID_PLUS else None
+        mean = mean_embedding(rows, consistency=contract.photo_consistency)
+        labels = [attributes or Attributes()] if binding.strategy is Strategy.HYBRID_PLUS else None
         stream = lift_stream(
             self._lift_secret,
             contract_id=contract.contract_id,
@@ -188,15 +171,15 @@ class Enroller:
             holder=None if holder is None else (holder.tenant, holder.subject),
         )
         lifted = lift(
-            self._source.project(descriptor[None]),
+            self._source.project(mean[None]),
             strategy=binding.strategy,
             m=binding.m,
             source=self._source,
             stream=stream,
-            attributes=named,
+            attributes=labels,
         )
         enrollment = self._enrollment(*self._turned_by_holder(lifted[0], holder))
-        return replace(enrollment, qualities=tuple(qualities), photos=len(distinct_rows(rows)))
+        return replace(enrollment, photos=len(distinct_rows(rows)))
 
     def from_template(self, data: bytes, *, holder: Holder | None = None) -> Enrollment:
         """Enroll a template that a client lifted, in the wire format, un-rotated.

@@ -6,13 +6,16 @@ pack are enough.
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Annotated, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, PlainValidator, ValidationError
 
 from models.pack import ModelPack
 from templates.contract import wire
 from templates.contract.binding import Binding
+from templates.contract.parsing import Cosine
 from templates.decoys import DecoyGenerator
 from templates.errors import ContractError
 from templates.keys.randomness import Keystream
@@ -20,59 +23,54 @@ from templates.space.agreement import mean_embedding
 from templates.space.lifting import lift
 
 
-class PublicContract:
-    """What a client may know of a contract.
+class ProbeCalibration(BaseModel):
+    """A kind of probe that the contract is calibrated for."""
 
-    Parameters
-    ----------
-    document
-        The JSON object of ``GET /v1/contract``, or of the contract file.
+    mode: str
+    probe_m: int
 
-    Raises
-    ------
-    ContractError
-        It is no contract, or contradicts itself.
-    """
 
-    def __init__(self, document: Mapping[str, object]) -> None:
-        self.binding = Binding.from_json(document.get("binding"))
-        if document.get("contract_id") != self.binding.contract_id:
+class PublicContract(BaseModel):
+    """What a client may know of a contract: its binding, its limits, and the probes it takes."""
+
+    contract_id: str
+    binding: Annotated[Binding, PlainValidator(Binding.from_json)]
+    photo_consistency: Cosine
+    probe_consistency: Cosine
+    calibrations: list[ProbeCalibration]
+
+    @classmethod
+    def read(cls, document: Mapping[str, object]) -> Self:
+        """Read the JSON object of ``GET /v1/contract``, or of the contract file.
+
+        Raises
+        ------
+        ContractError
+            It is no contract, or contradicts itself.
+        """
+        try:
+            contract = cls.model_validate(document)
+        except ValidationError as error:
+            first = error.errors(include_input=False)[0]
+            place = ".".join(map(str, first["loc"]))
+            raise ContractError(f"the contract, {place}: {first['msg'].lower()}") from None
+        if contract.contract_id != contract.binding.contract_id:
             raise ContractError("the contract_id is not the hash of the binding")
-        self._document = document
-        entries = document.get("calibrations")
-        if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-            raise ContractError("the contract lacks its calibrations")
-        self.probe_dimensions: list[int] = sorted(
-            {
-                int(entry["probe_m"])
-                for entry in entries
-                if entry.get("mode") == "s2s" and isinstance(entry.get("probe_m"), int)
-            }
-        )
-
-    @property
-    def contract_id(self) -> str:
-        """What its templates name, 64 hexadecimal digits."""
-        return self.binding.contract_id
-
-    def consistency(self, *, probe: bool) -> float:
-        """Return the least agreement of the photos of one probe, or of one enrollment."""
-        name = "probe_consistency" if probe else "photo_consistency"
-        consistency = self._document.get(name)
-        if not isinstance(consistency, int | float) or not -1 <= consistency <= 1:
-            raise ContractError(f"the contract lacks its {name}")
-        return float(consistency)
+        return contract
 
     def probe_dimension(self, dim: int | None) -> int:
         """Return the dimension of a probe: `dim`, or the largest that the contract takes."""
-        if not self.probe_dimensions:
+        known = sorted({entry.probe_m for entry in self.calibrations if entry.mode == "s2s"})
+        if not known:
             raise ContractError(
                 "the contract takes no lifted probes; calibrate it with --probe-dims"
             )
-        if dim not in (None, *self.probe_dimensions):
-            known = ", ".join(map(str, self.probe_dimensions))
-            raise ContractError(f"the contract takes lifted probes of dimension {known}, not {dim}")
-        return dim or self.probe_dimensions[-1]
+        if dim not in (None, *known):
+            listed = ", ".join(map(str, known))
+            raise ContractError(
+                f"the contract takes lifted probes of dimension {listed}, not {dim}"
+            )
+        return dim or known[-1]
 
     def load_pack(self, folder: Path) -> ModelPack:
         """Load the contract's model pack, and refuse another."""
@@ -90,29 +88,20 @@ class PublicContract:
         return source
 
     def lift(
-        self,
-        embeddings: NDArray[np.float32],
-        decoys: DecoyGenerator,
-        *,
-        m: int,
-        probe: bool,
+        self, embeddings: NDArray[np.float32], decoys: DecoyGenerator, *, m: int, probe: bool
     ) -> bytes:
         """Average unit embeddings (N, n) of one person, lift the mean, and encode the template.
 
-        Parameters
-        ----------
-        decoys
-            What :meth:`require_decoys` returned.
-        m
-            Dimension: the binding's, or one of :meth:`probe_dimension`.
+        ``decoys`` is what :meth:`require_decoys` returned; ``m`` is the binding's, or one of
+        :meth:`probe_dimension`.
         """
-        mean = mean_embedding(embeddings, consistency=self.consistency(probe=probe))
-        stream = Keystream.fresh()
+        consistency = self.probe_consistency if probe else self.photo_consistency
+        mean = mean_embedding(embeddings, consistency=consistency)
         batch = lift(
             decoys.project(mean[None]),
             strategy=self.binding.strategy,
             m=m,
             source=decoys,
-            stream=stream,
+            stream=Keystream.fresh(),
         )
         return wire.encode(batch[0], contract_id=self.contract_id)

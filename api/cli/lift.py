@@ -141,4 +141,4 @@ def embed_file(pack: ModelPack, photo: Path, *, policy: FacePolicy) -> np.ndarra
 def read_contract(path: Path) -> PublicContract:
     """Read the public part of a contract from a file."""
     document = parse_object(read_bounded(path, MAX_CONTRACT_BYTES), what="the contract")
-    return PublicContract(dict(document))
+    return PublicContract.read(document)

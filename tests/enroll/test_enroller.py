@@ -69,7 +69,9 @@ def test_the_template_holds_the_mean_of_the_photos_and_is_rotated(
     assert not rotated.subspace.contains(mean, tol=0.3).any()
     assert rotated.contract_id == enrollment.contract_id == contract.contract_id
     assert rotated.dtype == "float16"
-    assert enrollment.qualities == (None,) * 3
+    text = repr(enrollment)
+    assert "wire" not in text
+    assert len(text) < 400
 
 
 def largest_angle(first: SubspaceBatch, second: SubspaceBatch) -> float:
@@ -98,7 +100,6 @@ def test_a_photo_given_twice_is_as_if_it_were_given_once(
     once = enroller.from_embeddings(PHOTOS[sorted(set(rows))])
     twice = enroller.from_embeddings(PHOTOS[rows])
     assert largest_angle(stored_template(once), stored_template(twice)) < 1e-2
-    assert len(twice.qualities) == len(rows)
     assert twice.photos == len(set(rows))
 
 
@@ -166,15 +167,6 @@ def test_a_stranger_among_the_photos_is_named_without_numbers_of_them(enroller: 
     assert "0." not in str(caught.value)
 
 
-def test_two_people_with_two_photos_each_are_refused(enroller: Enroller) -> None:
-    """Each photo has a companion, and so is like the mean of the other three."""
-    both = np.stack([PHOTOS[0], PHOTOS[4], PHOTOS[5], PHOTOS[1]])
-    with pytest.raises(InconsistentImages) as caught:
-        enroller.from_embeddings(both)
-    assert {caught.value.apart, caught.value.others} == {(0, 3), (1, 2)}
-    assert caught.value.photos == (0, 1, 2, 3)
-
-
 @pytest.mark.parametrize(
     "rows",
     [np.zeros((0, N)), np.repeat(PHOTOS[:1], 11, axis=0), 2 * PHOTOS[:1], PHOTOS[:1, :5]],
@@ -188,14 +180,7 @@ def test_malformed_embeddings_are_refused(enroller: Enroller, rows: NDArray[np.f
 class FakePack(ModelPack):
     """Stands for a model pack: the photo's byte is the row of ``PHOTOS``; 255 has no face."""
 
-    def __init__(self, contract: Contract, **changes: object) -> None:
-        binding = contract.binding
-        facts = {
-            "embedder_sha256": binding.embedder_sha256,
-            "preprocessing": dict(binding.preprocessing),
-            "n": binding.n,
-        } | changes
-        self.info = type("Info", (), facts)
+    def __init__(self) -> None: ...
 
     def embed_photo(self, photo: bytes, **_: object) -> Any:
         if photo == b"\xff":
@@ -205,68 +190,38 @@ class FakePack(ModelPack):
         return type("Sample", (), facts)
 
 
-def test_photos_are_embedded_and_enrolled(contract: Contract, enroller: Enroller) -> None:
-    enrollment = enroller.from_photos(FakePack(contract), [b"\x00", b"\x01"])
+def test_photos_are_embedded_and_enrolled(enroller: Enroller) -> None:
+    enrollment = enroller.from_photos(FakePack(), [b"\x00", b"\x01"])
     assert enrollment.qualities == ("good", "good")
     mean = projected(unit(PHOTOS[0] + PHOTOS[1]))[None]
     assert stored_template(enrollment).contains(mean, tol=2e-3).all()
 
 
-def test_files_of_the_same_pixels_give_the_same_set(contract: Contract, enroller: Enroller) -> None:
+def test_files_of_the_same_pixels_give_the_same_set(enroller: Enroller) -> None:
     first, again, other = (
-        stored_template(enroller.from_photos(FakePack(contract), photos))
+        stored_template(enroller.from_photos(FakePack(), photos))
         for photos in ([b"\x00a", b"\x01a"], [b"\x00b", b"\x01a"], [b"\x00a", b"\x02a"])
     )
     assert largest_angle(first, again) < 1e-2
     assert largest_angle(first, other) > 0.9
 
 
-def test_one_unusable_photo_refuses_the_set(contract: Contract, enroller: Enroller) -> None:
+def test_one_unusable_photo_refuses_the_set(enroller: Enroller) -> None:
     with pytest.raises(PhotoRejected, match="photo 2 of 2: no face") as caught:
-        enroller.from_photos(FakePack(contract), [b"\x00", b"\xff"])
+        enroller.from_photos(FakePack(), [b"\x00", b"\xff"])
     assert caught.value.index == 1
     assert isinstance(caught.value.cause, NoFace)
-    with pytest.raises(ValueError, match="1 to 10 photos"):
-        enroller.from_photos(FakePack(contract), [b"\x00"] * 11)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"embedder_sha256": "cd" * 32}, "embedder abab.* the pack's is cdcd"),
-        ({"n": 128}, "64 numbers, the pack gives 128"),
-        (
-            {"preprocessing": {"size": 112, "mean": [0, 0, 0], "flip": False}},
-            r"mean: contract \[127.5.*pack \[0",
-        ),
-    ],
-)
-def test_another_pack_is_refused_naming_both_sides(
-    contract: Contract, enroller: Enroller, changes: dict[str, object], message: str
-) -> None:
-    with pytest.raises(ContractMismatch, match=message):
-        enroller.from_photos(FakePack(contract, **changes), [b"\x00"])
-
-
-def test_another_source_or_rotation_is_refused(contract: Contract) -> None:
+def test_another_source_is_refused(contract: Contract) -> None:
     people = draw_people(400, photos=(1,), seed=102).descriptors
     other = DecoyGenerator.fit(people).reduced(K)
     with pytest.raises(ContractMismatch, match=other.source_id[:16]):
         Enroller(contract, other, rotation=ROTATION, lift_secret=LIFT_SECRET)
-    with pytest.raises(ContractMismatch, match="turns 8"):
-        Enroller(contract, make_generator(), rotation=tenant_rotation(8), lift_secret=LIFT_SECRET)
 
 
 def client_template(contract: Contract, *, m: int = M) -> SubspaceBatch:
     return lift(POINTS[:1], strategy=contract.binding.strategy, m=m, source=make_generator())[0]
-
-
-def test_a_clients_template_is_rotated_and_kept(contract: Contract, enroller: Enroller) -> None:
-    sent = client_template(contract)
-    enrollment = enroller.from_template(wire.encode(sent, contract_id=contract.contract_id))
-    assert enrollment.qualities == ()
-    assert stored_template(enrollment).contains(POINTS[:1], tol=3e-3).all()
-    assert not wire.decode(enrollment.wire).subspace.contains(POINTS[:1], tol=0.3).any()
 
 
 def test_a_clients_basis_is_replaced_by_a_random_one_of_the_same_set(
@@ -280,6 +235,7 @@ def test_a_clients_basis_is_replaced_by_a_random_one_of_the_same_set(
         seen = template.basis.astype(np.float64)
         np.testing.assert_allclose(seen.T @ seen, own.T @ own, atol=2e-3)
         np.testing.assert_allclose(template.foot, sent.foot, atol=1e-3)
+        assert template.contains(POINTS[:1], tol=3e-3).all()
         # Haar-distributed rows: that all lie near the client's has probability below 1e-9.
         assert np.abs(seen @ own.T - np.eye(M)).max() > 0.1
     assert np.abs(first.basis - second.basis).max() > 0.05
@@ -299,13 +255,6 @@ def test_clients_templates_that_break_the_contract_are_refused(
         enroller.from_template(wire.encode(central, contract_id=contract_id))
     with pytest.raises(InvalidTemplate):
         enroller.from_template(b"")
-
-
-def test_nothing_private_shows(enroller: Enroller) -> None:
-    enrollment = enroller.from_embeddings(PHOTOS[:3])
-    text = repr(enrollment)
-    assert "wire" not in text
-    assert len(text) < 400
 
 
 def test_hybrid_plus_takes_attributes_and_does_without() -> None:

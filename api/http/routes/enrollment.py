@@ -97,7 +97,7 @@ async def enroll(
                 replaced=not stored.created,
                 holder_key=enrollment.holder_salt is not None,
                 images=[
-                    Photo(index=index, status="used", quality=quality.as_dict() if quality else {})
+                    Photo(index=index, status="used", quality=quality.as_dict())
                     for index, quality in enumerate(enrollment.qualities)
                 ],
             )

@@ -39,7 +39,7 @@ class Lifter:
             from templates.contract.canonical import parse_object
             from templates.decoys import DecoyGenerator
 
-            public = PublicContract(parse_object(contract.raw, what="the contract"))
+            public = PublicContract.read(parse_object(contract.raw, what="the contract"))
             decoys = public.require_decoys(DecoyGenerator.from_bytes(generator.data))
             return cls(public, decoys, public.load_pack(pack))
 
