@@ -19,8 +19,8 @@ from models.embedding import Embedder, Preprocessing, normalises_inside
 from models.errors import ImageError, ModelError, PackError, PhotoRejected
 from models.faces import FaceCrop, FaceSample
 from models.liveness import PassiveLiveness, open_liveness
-from models.pack_file import PackFile
-from models.pack_graphs import PackGraph, Role, image_size, locate, pick, read_graph
+from models.pack_file import PackFile, read_pack_file
+from models.pack_graphs import PackGraph, Role, image_size, pick, read_graphs
 from models.quality import DEFAULT_QUALITY, Quality, QualityLimits, check, measure
 from models.selection import FacePolicy, select_face
 
@@ -30,7 +30,7 @@ class DetectorInfo:
     """The detector of a pack: recorded with a contract, not bound by it."""
 
     kind: str
-    file: str
+    file: Path
     sha256: str
     input_size: tuple[int, int]
 
@@ -41,7 +41,7 @@ class PackInfo:
 
     name: str
     n: int
-    embedder_file: str
+    embedder_file: Path
     embedder_sha256: str
     preprocessing: dict[str, Any]  # with the hash it decides whether embeddings are comparable
     detector: DetectorInfo | None  # None where the pack takes aligned crops only
@@ -98,7 +98,6 @@ class ModelPack:
         providers: Sequence[str] = ("cpu",),
         threads: int | None = None,
         flip: bool = False,
-        detector_size: int | None = None,
     ) -> "ModelPack":
         """Load a pack from a folder of ``.onnx`` files, or from a single embedder file.
 
@@ -110,8 +109,6 @@ class ModelPack:
             Threads inside one inference; ``None`` for all cores.
         flip
             Add the mirrored crop's raw embedding. Bound by the contract.
-        detector_size
-            Side of the detection canvas, a multiple of 32; default ``pack.toml``, then 640.
 
         Raises
         ------
@@ -120,29 +117,27 @@ class ModelPack:
         ProviderUnavailable
             If a requested provider is absent or does not start.
         """
-        location, stated = locate(Path(path))
-        graphs = [
-            read_graph(file, stated, providers=providers, threads=threads)
-            for file in location.files
-        ]
-        embedder_graph, detector_graph = pick(graphs, location.folder)
+        path = Path(path)
+        graphs = read_graphs(path, providers=providers, threads=threads)
+        folder = graphs[0].path.parent
+        stated = read_pack_file(folder)
+        embedder_graph, detector_graph = pick(graphs)
         embedder = _embedder(embedder_graph, stated, flip)
         detector = detector_info = None
         if detector_graph is not None:
-            size = detector_size or stated.detector.input_size or DEFAULT_SIZE
-            detector = _detector(detector_graph, size)
             # A size without a common template fails here rather than at the first photo.
             template(embedder.preprocessing.size)
+            detector = _detector(detector_graph, stated)
             detector_info = DetectorInfo(
                 kind=detector.kind,
-                file=detector_graph.file,
+                file=detector_graph.path,
                 sha256=detector_graph.sha256,
                 input_size=detector.sizes[0],
             )
         info = PackInfo(
-            name=location.name,
+            name=path.stem if path.is_file() else path.resolve().name,
             n=embedder.n,
-            embedder_file=embedder_graph.file,
+            embedder_file=embedder_graph.path,
             embedder_sha256=embedder_graph.sha256,
             preprocessing=embedder.preprocessing.as_dict(),
             detector=detector_info,
@@ -150,7 +145,7 @@ class ModelPack:
         liveness = open_liveness(
             [graph for graph in graphs if graph.role is Role.LIVENESS],
             stated,
-            location.folder,
+            folder,
             detects=detector is not None,
         )
         return cls(info, embedder=embedder, detector=detector, liveness=liveness)
@@ -318,8 +313,6 @@ def _embedder(graph: PackGraph, stated: PackFile, flip: bool) -> Embedder:
         raise PackError(f"{graph.path} was routed as an embedder and fails: {error}") from error
 
 
-def _detector(graph: PackGraph, size: int) -> Detector:
-    if size < 32 or size % 32:
-        raise PackError(f"The detector size must be a multiple of 32, not {size}.")
+def _detector(graph: PackGraph, stated: PackFile) -> Detector:
     kind = Scrfd if graph.role is Role.SCRFD else YuNet
-    return kind(graph.session, size=size)
+    return kind(graph.session, size=stated.detector.input_size or DEFAULT_SIZE)

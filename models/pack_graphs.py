@@ -25,11 +25,9 @@ class Role(StrEnum):
     SCRFD = "scrfd"
     SCRFD_WITHOUT_KEYPOINTS = "scrfd-without-keypoints"
     YUNET = "yunet"
-    GENDER_AGE = "gender-age"
-    LANDMARKS = "landmarks"
     LIVENESS = "liveness"
     EMBEDDER = "embedder"
-    UNKNOWN = "unknown"
+    UNUSED = "unused"
 
 
 @dataclass(frozen=True)
@@ -58,30 +56,30 @@ class PackGraph:
         return ", ".join(map(str, self.session.outputs))
 
 
-@dataclass(frozen=True)
-class Location:
-    """Where a pack was found: its name, its folder, and its ``.onnx`` files."""
+def read_graphs(
+    pack: Path, *, providers: Sequence[str] = ("cpu",), threads: int | None = None
+) -> list[PackGraph]:
+    """Load and recognise every graph of a pack, also of one that cannot be used.
 
-    name: str
-    folder: Path
-    files: list[Path]
+    Raises
+    ------
+    PackError
+        If there is no graph, a file that is none, or a wrong ``pack.toml``.
+    """
+    files = _files(pack)
+    stated = read_pack_file(files[0].parent)
+    return [_read_graph(file, stated, providers, threads) for file in files]
 
 
-def inspect(path: str | Path) -> list[PackGraph]:
-    """What every graph of a pack is, and why; unusable packs are reported, not refused."""
-    location, stated = locate(Path(path))
-    return [read_graph(file, stated) for file in location.files]
-
-
-def locate(path: Path) -> tuple[Location, PackFile]:
-    """Find the graphs of a folder, or the one that a file is, and what ``pack.toml`` states."""
-    if path.is_file():
-        if path.suffix.lower() != _SUFFIX:
-            raise PackError(f"{path} is not an .onnx file; name a pack folder or an embedder.")
-        return Location(path.stem, path.parent, [path]), read_pack_file(path.parent)
-    if not path.is_dir():
-        raise PackError(f"{path} does not exist; name a folder of .onnx files or one embedder.")
-    for folder in (path, path / path.resolve().name):
+def _files(pack: Path) -> list[Path]:
+    """Find the graphs of a folder, or the one that a file is."""
+    if pack.is_file():
+        if pack.suffix.lower() != _SUFFIX:
+            raise PackError(f"{pack} is not an .onnx file; name a pack folder or an embedder.")
+        return [pack]
+    if not pack.is_dir():
+        raise PackError(f"{pack} does not exist; name a folder of .onnx files or one embedder.")
+    for folder in (pack, pack / pack.resolve().name):
         # Hidden files are leftovers of archives ("._model.onnx" of macOS).
         files = sorted(
             file
@@ -89,18 +87,13 @@ def locate(path: Path) -> tuple[Location, PackFile]:
             if file.suffix.lower() == _SUFFIX and file.is_file()
         )
         if files:
-            return Location(path.resolve().name, folder, files), read_pack_file(folder)
-    raise PackError(f"{path} has no .onnx files; put the weights of a pack there.")
+            return files
+    raise PackError(f"{pack} has no .onnx files; put the weights of a pack there.")
 
 
-def read_graph(
-    path: Path,
-    stated: PackFile,
-    *,
-    providers: Sequence[str] = ("cpu",),
-    threads: int | None = None,
+def _read_graph(
+    path: Path, stated: PackFile, providers: Sequence[str], threads: int | None
 ) -> PackGraph:
-    """Load and recognise one graph."""
     try:
         if path.stat().st_size > _MAX_MODEL_BYTES:
             raise PackError(f"{path} is larger than {_MAX_MODEL_BYTES} bytes: not a face model.")
@@ -129,49 +122,46 @@ def classify(
 ) -> tuple[Role, str]:
     """Route a graph by its signature (docs/models.md "Packs")."""
     size = image_size(inputs)
-    last = [output.shape[-1] if output.shape else None for output in outputs]
+    widths = sorted(output.shape[-1] or 0 if output.shape else 0 for output in outputs)
     if size is None:
-        return Role.UNKNOWN, "its input is not one float32 image (batch, 3, h, w)"
+        return Role.UNUSED, "its input is not one float32 image (batch, 3, h, w)"
     if {output.name for output in outputs}.issuperset(YUNET_OUTPUTS):
         return Role.YUNET, "outputs cls_8 ... kps_32"
-    match sorted(width or 0 for width in last):
-        case [1, 1, 1, 4, 4, 4, 10, 10, 10]:
+    match size, widths:
+        case _, [1, 1, 1, 4, 4, 4, 10, 10, 10]:
             return Role.SCRFD, "scores, boxes and five points at three strides (9 outputs)"
-        case [1, 1, 1, 4, 4, 4]:
+        case _, [1, 1, 1, 4, 4, 4]:
             return (
                 Role.SCRFD_WITHOUT_KEYPOINTS,
                 "scores and boxes at three strides without keypoints (6 outputs): it cannot align",
             )
-    if size == (96, 96) and last == [3]:
-        return Role.GENDER_AGE, "96 x 96 input and 3 output values; ignored"
-    if size == (80, 80) and last == [3]:
-        return Role.LIVENESS, "80 x 80 input and 3 output values (MiniFASNet)"
-    if size == (192, 192):
-        return Role.LANDMARKS, "192 x 192 input; ignored"
+        case (96, 96), [3]:
+            return Role.UNUSED, "96 x 96 input and 3 output values: gender and age"
+        case (80, 80), [3]:
+            return Role.LIVENESS, "80 x 80 input and 3 output values (MiniFASNet)"
+        case (192, 192), _:
+            return Role.UNUSED, "192 x 192 input: landmarks"
     height, width = (input_size if side is None else side for side in size)
+    reason = None
     if height is None or width is None:
-        return (
-            Role.UNKNOWN,
-            "the input size is open; where this is an embedder, state input_size in pack.toml",
+        reason = "the input size is open; where this is an embedder, state input_size in pack.toml"
+    elif height != width or height < 112 or height % 16:
+        reason = f"the {width} x {height} input is not a square of at least 112 that 16 divides"
+    elif len(outputs) != 1 or len(outputs[0].shape) != 2:
+        reason = "no known detector, and not exactly one output (batch, values)"
+    elif widths[0] in (2, 3):
+        reason = (
+            f"{widths[0]} output values are no embedding; a liveness graph is stated in pack.toml,"
+            " under [[liveness]]"
         )
-    if height != width or height < 112 or height % 16:
-        return (
-            Role.UNKNOWN,
-            f"the {width} x {height} input is not a square of at least 112 that 16 divides",
-        )
-    if len(outputs) != 1 or len(outputs[0].shape) != 2:
-        return Role.UNKNOWN, "no known detector, and not exactly one output (batch, values)"
-    if last[0] in (2, 3):
-        return (
-            Role.UNKNOWN,
-            f"{last[0]} output values are no embedding; a liveness graph is stated in pack.toml,"
-            " under [[liveness]]",
-        )
+    if reason is not None:
+        return Role.UNUSED, reason
     return Role.EMBEDDER, f"square {width} x {height} input and one 2-D output"
 
 
-def pick(graphs: Sequence[PackGraph], folder: Path) -> tuple[PackGraph, PackGraph | None]:
+def pick(graphs: Sequence[PackGraph]) -> tuple[PackGraph, PackGraph | None]:
     """Choose the embedder and, where there is one, the detector."""
+    folder = graphs[0].path.parent
     embedders = [graph for graph in graphs if graph.role is Role.EMBEDDER]
     detectors = [graph for graph in graphs if graph.role in (Role.SCRFD, Role.YUNET)]
     for kind, several in (("embedders", embedders), ("detectors", detectors)):

@@ -17,7 +17,7 @@ from models.known_packs import KNOWN_PACKS
 from models.liveness import LivenessGraph
 from models.pack import ModelPack, PackInfo
 from models.pack_file import FILE_NAME, pack_file_text
-from models.pack_graphs import inspect as inspect_pack
+from models.pack_graphs import read_graphs
 from templates.keys.private_file import replace_public
 
 NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,63}")
@@ -125,7 +125,7 @@ def _described(pack: ModelPack) -> dict[str, object]:
     return {
         "name": info.name,
         "n": info.n,
-        "embedder": info.embedder_file,
+        "embedder": info.embedder_file.name,
         "embedder_sha256": info.embedder_sha256,
         "preprocessing": info.preprocessing,
         "detector": None if info.detector is None else info.detector.kind,
@@ -162,7 +162,7 @@ def inspect(
 
     Example: `veilface models inspect ~/.insightface/models/buffalo_l`
     """
-    graphs = inspect_pack(pack)
+    graphs = read_graphs(pack)
     loaded, refusal = None, None
     try:
         loaded = ModelPack.load(pack)

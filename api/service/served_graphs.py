@@ -7,10 +7,8 @@ from typing import Literal
 
 from api.http.errors import ApiError, StartError
 from api.settings import Settings
-from models.errors import PackError
 from models.known_packs import KNOWN_PACKS
 from models.pack import ModelPack
-from models.pack_graphs import locate
 
 
 @dataclass(frozen=True)
@@ -49,19 +47,12 @@ def served_graphs(settings: Settings, pack: ModelPack | None) -> dict[str, Serve
     """Return the graphs by their hashes, the detector first; none where the setting is off."""
     if not settings.serve_pack:
         return {}
-    if pack is None or settings.pack is None:
+    if pack is None:
         raise StartError("setting serve_pack: there is no pack to serve; set pack as well")
-    try:
-        folder = locate(settings.pack)[0].folder
-    except PackError as error:
-        raise StartError(f"setting serve_pack: {error}") from None
     info, side = pack.info, pack.crop_size
-    graphs = [
-        _read(folder / info.embedder_file, "embedder", None, info.embedder_sha256, (side, side))
-    ]
+    graphs = [_read(info.embedder_file, "embedder", None, info.embedder_sha256, (side, side))]
     if (found := info.detector) is not None:
-        file = folder / found.file
-        graphs.insert(0, _read(file, "detector", found.kind, found.sha256, found.input_size))
+        graphs.insert(0, _read(found.file, "detector", found.kind, found.sha256, found.input_size))
     return {graph.sha256: graph for graph in graphs}
 
 

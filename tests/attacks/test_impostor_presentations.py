@@ -1,6 +1,7 @@
 """Attacks with a person's own photo through enrollment and verification."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ OTHERS = draw_people(8, photos=(PHOTOS,), noise=0.3, seed=71).descriptors.reshap
 INFO = PackInfo(
     name="tiny",
     n=N,
-    embedder_file="tiny.onnx",
+    embedder_file=Path("tiny.onnx"),
     embedder_sha256="ab" * 32,
     preprocessing={"size": 112, "mean": [127.5, 127.5, 127.5], "flip": False},
     detector=None,

@@ -181,6 +181,14 @@ def fixed_face_detector(box: Sequence[float], keypoints: np.ndarray, *, canvas: 
     return _save(graph)
 
 
+def linked_pack(folder: Path, pack: Path, toml: str) -> Path:
+    """A pack's graphs in a writable folder, with a ``pack.toml``."""
+    for file in pack.glob("*.onnx"):
+        (folder / file.name).symlink_to(file)
+    (folder / "pack.toml").write_text(toml)
+    return folder
+
+
 def write_pack(folder: Path, **files: bytes) -> Path:
     """A pack folder with ``name=bytes`` written to ``name.onnx``."""
     folder.mkdir(parents=True, exist_ok=True)

@@ -84,7 +84,7 @@ def worst(pack, reference, photos, size):
 
 @pytest.mark.parametrize("size", [320, 640])
 def test_points_and_descriptors_are_those_of_insightface(size, mbf_pack_dir, lfw_photos):
-    pack = ModelPack.load(mbf_pack_dir, threads=1, detector_size=size)
+    pack = ModelPack.load(mbf_pack_dir, threads=1)
     reference = InsightFace(mbf_pack_dir, pack.info)
     paths = sorted(lfw_photos.glob("*/*_0001.jpg"))[::20]
     photos = [decode_image(path.read_bytes()) for path in paths]

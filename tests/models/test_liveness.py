@@ -1,7 +1,6 @@
 """Liveness graphs: which file is one, what it is fed, and what its output means."""
 
 import io
-import shutil
 
 import cv2
 import numpy as np
@@ -14,6 +13,7 @@ from models.liveness import box_region, crop_face, square_region
 from models.pack import ModelPack
 from tests.models.graphs import (
     fixed_face_detector,
+    linked_pack,
     mean_liveness,
     pooling_embedder,
     write_pack,
@@ -254,11 +254,8 @@ def test_real_graphs_tell_their_authors_photos_apart(
 ):
     folder = minifasnet_pack_dir
     if two_logits:
-        folder = tmp_path / "pack"
-        shutil.copytree(mbf_pack_dir, folder, copy_function=shutil.copyfile)
-        folder.chmod(0o755)
-        shutil.copyfile(shared_data / "packs" / "liveness_minifasnet_se" / SE, folder / SE)
-        (folder / "pack.toml").write_text(SQUARE.replace("two.onnx", SE))
+        folder = linked_pack(tmp_path, mbf_pack_dir, SQUARE.replace("two.onnx", SE))
+        (folder / SE).symlink_to(shared_data / "packs" / "liveness_minifasnet_se" / SE)
     pack = ModelPack.load(folder)
     for photo in sorted((shared_data / "packs" / "liveness").glob("*.jpg")):
         sample = pack.embed_photo(photo.read_bytes(), policy=None, quality=None, liveness=True)

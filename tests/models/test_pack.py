@@ -13,7 +13,7 @@ from models.errors import (
     PackError,
 )
 from models.pack import ModelPack
-from models.pack_graphs import Role, inspect
+from models.pack_graphs import Role, read_graphs
 from models.selection import FacePolicy
 from tests.models import graphs
 from tests.models.graphs import pooled, pooling_embedder, unit, write_pack
@@ -167,10 +167,10 @@ def test_neither_samples_nor_faces_show_numbers_of_a_descriptor(blind):
 
 def test_inspect_reports_also_what_cannot_be_loaded(tmp_path, mbf_pack_dir):
     folder = write_pack(tmp_path, a=pooling_embedder(), b=pooling_embedder(128), g=GENDER)
-    reports = {report.file: report for report in inspect(folder)}
-    assert [r.role for r in reports.values()] == [Role.EMBEDDER, Role.EMBEDDER, Role.GENDER_AGE]
-    assert "ignored" in reports["g.onnx"].reason
-    real = {report.file: report for report in inspect(mbf_pack_dir)}
+    reports = {report.file: report for report in read_graphs(folder)}
+    assert [r.role for r in reports.values()] == [Role.EMBEDDER, Role.EMBEDDER, Role.UNUSED]
+    assert "gender and age" in reports["g.onnx"].reason
+    real = {report.file: report for report in read_graphs(mbf_pack_dir)}
     assert real["w600k_mbf.onnx"].inputs == "input[?, 3, 112, 112]"
     digest = hashlib.sha256((mbf_pack_dir / "w600k_mbf.onnx").read_bytes()).hexdigest()
     assert real["w600k_mbf.onnx"].sha256 == digest

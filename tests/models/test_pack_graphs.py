@@ -5,7 +5,7 @@ import onnx
 import pytest
 
 from models.errors import PackError
-from models.pack_graphs import Role, classify, inspect
+from models.pack_graphs import Role, classify, read_graphs
 from models.sessions import Tensor
 from tests.models.graphs import pooling_embedder
 
@@ -20,37 +20,37 @@ YUNET = [f"{role}_{stride}" for role in ("cls", "obj", "bbox", "kps") for stride
         ((1, 3, None, None), SCRFD, Role.SCRFD),
         ((1, 3, 640, 640), [(1, *shape) for shape in SCRFD], Role.SCRFD),
         ((1, 3, None, None), SCRFD[:6], Role.SCRFD_WITHOUT_KEYPOINTS),
-        ((None, 3, 96, 96), [(1, 3)], Role.GENDER_AGE),
-        ((None, 3, 192, 192), [(1, 212)], Role.LANDMARKS),
-        ((None, 3, 192, 192), [(1, 3309)], Role.LANDMARKS),
+        ((None, 3, 96, 96), [(1, 3)], Role.UNUSED),
+        ((None, 3, 192, 192), [(1, 212)], Role.UNUSED),
+        ((None, 3, 192, 192), [(1, 3309)], Role.UNUSED),
         (IMAGE, [(1, 512)], Role.EMBEDDER),
         ((None, 3, 128, 128), [(None, 256)], Role.EMBEDDER),
         ((None, None, 112, 112), [(None, None)], Role.EMBEDDER),
-        (IMAGE, [(1, 512), (1, 512)], Role.UNKNOWN),
-        (IMAGE, [(1, 512, 1, 1)], Role.UNKNOWN),
-        (IMAGE, [()], Role.UNKNOWN),
-        ((None, 3, 112, 96), [(1, 512)], Role.UNKNOWN),
-        ((None, 3, 120, 120), [(1, 512)], Role.UNKNOWN),
-        ((None, 3, 96, 96), [(1, 512)], Role.UNKNOWN),
-        ((None, 1, 112, 112), [(1, 512)], Role.UNKNOWN),
+        (IMAGE, [(1, 512), (1, 512)], Role.UNUSED),
+        (IMAGE, [(1, 512, 1, 1)], Role.UNUSED),
+        (IMAGE, [()], Role.UNUSED),
+        ((None, 3, 112, 96), [(1, 512)], Role.UNUSED),
+        ((None, 3, 120, 120), [(1, 512)], Role.UNUSED),
+        ((None, 3, 96, 96), [(1, 512)], Role.UNUSED),
+        ((None, 1, 112, 112), [(1, 512)], Role.UNUSED),
         ((None, 3, 80, 80), [(None, 3)], Role.LIVENESS),
-        ((None, 3, 80, 80), [(None, 2)], Role.UNKNOWN),
+        ((None, 3, 80, 80), [(None, 2)], Role.UNUSED),
         # Two or three numbers are no embedding, whatever the size.
-        ((None, 3, 128, 128), [(None, 2)], Role.UNKNOWN),
-        (IMAGE, [(None, 3)], Role.UNKNOWN),
-        ((1, 4), [(1, 512)], Role.UNKNOWN),
+        ((None, 3, 128, 128), [(None, 2)], Role.UNUSED),
+        (IMAGE, [(None, 3)], Role.UNUSED),
+        ((1, 4), [(1, 512)], Role.UNUSED),
     ],
 )
 def test_routing_by_signature(image, outputs, role):
     made = [Tensor(f"o{place}", shape) for place, shape in enumerate(outputs)]
     assert classify([Tensor("data", image)], made)[0] is role
-    assert classify([Tensor("data", image)] * 2, made)[0] is Role.UNKNOWN
+    assert classify([Tensor("data", image)] * 2, made)[0] is Role.UNUSED
 
 
 def test_an_open_input_size_is_an_embedder_once_it_is_stated():
     image, embedding = [Tensor("data", (None, 3, None, None))], [Tensor("e", (None, 512))]
     role, reason = classify(image, embedding)
-    assert role is Role.UNKNOWN
+    assert role is Role.UNUSED
     assert "pack.toml" in reason
     assert classify(image, embedding, input_size=112)[0] is Role.EMBEDDER
 
@@ -61,7 +61,7 @@ def test_an_open_input_size_is_an_embedder_once_it_is_stated():
 def test_what_is_no_model_is_named(tmp_path, junk):
     (tmp_path / "some.onnx").write_bytes(junk)
     with pytest.raises(PackError, match=r"some\.onnx is not a readable ONNX model"):
-        inspect(tmp_path)
+        read_graphs(tmp_path)
 
 
 @pytest.mark.parametrize("is_constant", [False, True])
@@ -82,12 +82,12 @@ def test_weights_in_another_file_are_refused(tmp_path, monkeypatch, is_constant)
     (tmp_path / "secret").write_bytes(np.ones(1, np.float32).tobytes())
     (tmp_path / "x.onnx").write_bytes(proto.SerializeToString())
     with pytest.raises(PackError, match="weights lie in another file, convert"):
-        inspect(tmp_path)
+        read_graphs(tmp_path)
 
 
 def test_real_packs(mbf_pack_dir, yunet_pack_dir, shared_data):
     folders = (mbf_pack_dir, yunet_pack_dir, shared_data / "packs" / "liveness")
-    seen = {graph.file: graph.role for folder in folders for graph in inspect(folder)}
+    seen = {graph.file: graph.role for folder in folders for graph in read_graphs(folder)}
     assert seen == {
         "det_500m_kps.onnx": Role.SCRFD,
         "w600k_mbf.onnx": Role.EMBEDDER,

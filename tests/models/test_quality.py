@@ -13,6 +13,7 @@ from models.quality import (
 )
 from models.selection import FacePolicy
 from models.synthetic import encode_photo
+from tests.models.graphs import linked_pack
 
 GOOD = Quality(
     score=0.9,
@@ -109,8 +110,10 @@ DEGRADED = {
 
 
 @pytest.fixture(scope="module")
-def pack(mbf_pack_dir):
-    return ModelPack.load(mbf_pack_dir, threads=1, detector_size=320)
+def pack(mbf_pack_dir, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("pack")
+    smaller_canvas = "[detector]\ninput_size = 320\n"
+    return ModelPack.load(linked_pack(folder, mbf_pack_dir, smaller_canvas), threads=1)
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from api.demo.people import Scale
 from api.demo.run import Counts, faults_of, run_demo
 from api.http.errors import StartError
 from models.demo import DEMO_NOTICE
-from models.pack_graphs import Role, inspect
+from models.pack_graphs import Role, read_graphs
 from tests.api.cli.conftest import run
 
 SMALL = Scale(
@@ -135,7 +135,9 @@ def test_it_fails_when_it_should():
 @pytest.mark.long
 def test_real_faces_and_weights(mbf_pack_dir, lfw_aligned, tmp_path):
     """The embedder alone, on aligned crops: detection is tested elsewhere, and takes long."""
-    embedder = next(graph.file for graph in inspect(mbf_pack_dir) if graph.role is Role.EMBEDDER)
+    embedder = next(
+        graph.file for graph in read_graphs(mbf_pack_dir) if graph.role is Role.EMBEDDER
+    )
     people = [path for path in sorted(lfw_aligned.iterdir()) if path.is_dir()]
     able = [path for path in people if 5 <= len(list(path.iterdir())) <= 7][:60]
     faces = tmp_path / "faces"
