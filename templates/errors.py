@@ -29,7 +29,6 @@
     ├── ClusterError [6]         a Dask cluster that cannot be used
     ├── AuditError [7]           an attack or an audit that cannot be made as it was asked for
     ├── StartError [8]           the service or a command cannot start
-    │   └── DatabaseAway         the database does not answer now
     ├── PreparationError [9]     decoys or a contract that cannot be made
     └── CommandError [10]        a command that cannot be done
         └── UsageError           wrong usage of a command

@@ -13,7 +13,13 @@ from api.cli.errors import CommandError
 from api.cli.options import STORE, takes_settings
 from api.cli.verdict import verdict_lines
 from api.limits.rates import RateLimits
-from api.service.opening import Deployment, key_beside_database, require_privacy
+from api.service.opening import (
+    Deployment,
+    key_beside_database,
+    open_deployment,
+    prepare_database,
+    require_privacy,
+)
 from api.service.runtime import Runtime
 from api.service.server import listen, run_server, tls_options
 from api.settings import Settings
@@ -83,8 +89,9 @@ def _opened(settings: Settings, *, check: bool) -> Iterator[Deployment]:
     tls_options(settings)
     RateLimits.open(settings)
     answers = check or settings.workers == 1
-    deployment = (Runtime if answers else Deployment).open(settings)
+    deployment = Runtime.open(settings) if answers else open_deployment(settings)
     with closing(deployment):
+        prepare_database(deployment.store)
         contract = deployment.contract
         binding = contract.binding
         if demo_notice(binding.embedder_sha256, n=binding.n):

@@ -16,7 +16,7 @@ from api.cli.photo_folders import albums_of
 from api.cli.results import Result, Table, reports
 from api.http.audit import operator
 from api.http.errors import ApiError
-from api.service.opening import weak_privacy
+from api.service.opening import prepare_database, weak_privacy
 from api.service.runtime import Runtime
 from api.settings import DEFAULT_TENANT, Settings
 from enroll.enroller import MAX_PHOTOS
@@ -158,9 +158,9 @@ def _enrolled(
     """Enroll somebody from photos; returned is what ``--json`` says of it."""
     runtime, tenant = entrance.runtime, entrance.tenant
     data = [read_photo(photo) for photo in photos]
-    epoch = runtime.epoch(tenant)
+    epoch = runtime.current_epoch(tenant)
     with _named(photos):
-        enrollment = runtime.enroller(tenant, epoch).from_photos(entrance.pack, data, policy=face)
+        enrollment = epoch.enroller.from_photos(entrance.pack, data, policy=face)
     stored = runtime.put(
         tenant,
         subject,
@@ -279,6 +279,7 @@ def _opened(settings: Settings, tenant: str) -> Iterator[_Entrance]:
     """
     runtime = Runtime.open(settings)
     try:
+        prepare_database(runtime.store)
         if runtime.pack is None:
             raise UsageError("photos need a model pack; name it with --pack")
         tenants = runtime.store.tenants

@@ -39,10 +39,6 @@ class StartError(VeilfaceError):
     """The program cannot start; the message is the one sentence that an operator reads."""
 
 
-class DatabaseAway(StartError):
-    """The database does not answer now; it may later."""
-
-
 class ErrorCode(NamedTuple):
     """Status of a code, and what it means."""
 

@@ -15,12 +15,11 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 from prometheus_client import (
+    REGISTRY,
     CollectorRegistry,
     Counter,
     Gauge,
     Histogram,
-    PlatformCollector,
-    ProcessCollector,
     disable_created_metrics,
     generate_latest,
 )
@@ -30,105 +29,81 @@ from api.http.errors import ERROR_CODES
 from api.service.environment import variables_set
 
 DIRECTORY_VARIABLE = "PROMETHEUS_MULTIPROC_DIR"
-
-UNMATCHED = "unmatched"
 METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
-LIMITS = ("key", "address")
-LOCKOUTS = ("locked", "disabled")
 SECONDS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10, 30)
 
 disable_created_metrics()  # type: ignore[no-untyped-call]
-REGISTRY = CollectorRegistry()
 
 REQUESTS = Counter(
     "veilface_requests",
     "Requests that were answered; status is `none` where the client went away first.",
     ("route", "method", "status"),
-    registry=REGISTRY,
 )
 REQUEST_SECONDS = Histogram(
     "veilface_request_seconds",
     "Seconds from a request's first line to its last byte, its body's arrival included.",
     ("route",),
     buckets=SECONDS,
-    registry=REGISTRY,
 )
-ERRORS = Counter("veilface_errors", "Errors that were answered.", ("code",), registry=REGISTRY)
+ERRORS = Counter("veilface_errors", "Errors that were answered.", ("code",))
 DECISIONS = Counter(
     "veilface_decisions",
     "Verifications and comparisons that were decided.",
     ("decision", "reason", "level", "probe"),
-    registry=REGISTRY,
 )
 STEP_SECONDS = Histogram(
-    "veilface_step_seconds",
-    "Seconds that one step of a request took.",
-    ("step",),
-    buckets=SECONDS,
-    registry=REGISTRY,
+    "veilface_step_seconds", "Seconds that one step of a request took.", ("step",), buckets=SECONDS
 )
-TOKENS = Counter(
-    "veilface_tokens", "Tokens that were made for browsers.", ("action",), registry=REGISTRY
-)
+TOKENS = Counter("veilface_tokens", "Tokens that were made for browsers.", ("action",))
 LOCKED_OUT = Counter(
     "veilface_lockouts",
     "Verifications that were refused because their subject was locked for a while or disabled.",
     ("kind",),
-    registry=REGISTRY,
 )
-RATE_LIMITED = Counter(
-    "veilface_rate_limited", "Requests over a rate limit.", ("limit",), registry=REGISTRY
-)
+RATE_LIMITED = Counter("veilface_rate_limited", "Requests over a rate limit.", ("limit",))
 RATE_STORAGE_FAILURES = Counter(
     "veilface_rate_limit_storage_failures",
     "Times that the shared storage of rate limits failed, and a worker counted for itself.",
-    registry=REGISTRY,
 )
-PURGE_FAILURES = Counter(
-    "veilface_purge_failures", "Rounds of housekeeping that failed.", registry=REGISTRY
-)
+PURGE_FAILURES = Counter("veilface_purge_failures", "Rounds of housekeeping that failed.")
 IN_FLIGHT = Gauge(
     "veilface_requests_in_flight",
     "Requests that are being answered now.",
     multiprocess_mode="livesum",
-    registry=REGISTRY,
 )
 COMPUTE_WAITING = Gauge(
     "veilface_compute_waiting",
     "Requests that wait for a compute slot now.",
     multiprocess_mode="livesum",
-    registry=REGISTRY,
 )
 STORE_UP = Gauge(
     "veilface_store_up",
     "Whether the database answered, and took a write after the last failure (1) or not (0).",
     multiprocess_mode="livemin",
-    registry=REGISTRY,
 )
 MODEL_UP = Gauge(
     "veilface_model_up",
     "Whether the last inference succeeded (1) or not (0); 1 where there is no pack.",
     multiprocess_mode="livemin",
-    registry=REGISTRY,
 )
 BUILD = Gauge(
     "veilface_build_info",
     "The program's version and the contract in force; always 1.",
     ("version", "contract_id"),
     multiprocess_mode="livemax",
-    registry=REGISTRY,
 )
 
 # A worker that starts has seen no failure yet; 0 would ring the alarm at each start.
 STORE_UP.set(1)
 MODEL_UP.set(1)
 # So that a rate over the first event is not missing: a series that appears with 1 has no rise.
-for _code in ERROR_CODES:
-    ERRORS.labels(_code)
-for _limit in LIMITS:
-    RATE_LIMITED.labels(_limit)
-for _kind in LOCKOUTS:
-    LOCKED_OUT.labels(_kind)
+for _counter, _labels in (
+    (ERRORS, tuple(ERROR_CODES)),
+    (RATE_LIMITED, ("key", "address")),
+    (LOCKED_OUT, ("locked", "disabled")),
+):
+    for _label in _labels:
+        _counter.labels(_label)
 
 
 def step(name: str) -> AbstractContextManager[object]:
@@ -136,21 +111,11 @@ def step(name: str) -> AbstractContextManager[object]:
     return STEP_SECONDS.labels(name).time()
 
 
-def count_decision(*, accepted: bool, reason: str, level: str, probe: str) -> None:
-    """Count one decision; ``probe`` is ``photo``, ``frames``, ``embedding`` or ``template``.
-
-    It is ``comparison`` where two photos were compared.
-    """
-    DECISIONS.labels("accept" if accepted else "reject", reason, level, probe).inc()
-
-
 def count_request(*, route: str | None, method: str, status: int, seconds: float) -> None:
     """Count one request; ``route`` is the route's template, None for a path that is unknown."""
-    named = UNMATCHED if route is None else route
-    REQUESTS.labels(
-        named, method if method in METHODS else "other", str(status) if status else "none"
-    ).inc()
-    REQUEST_SECONDS.labels(named).observe(seconds)
+    path, verb = route or "unmatched", method if method in METHODS else "other"
+    REQUESTS.labels(path, verb, str(status) if status else "none").inc()
+    REQUEST_SECONDS.labels(path).observe(seconds)
 
 
 def exposition() -> bytes:
@@ -158,7 +123,6 @@ def exposition() -> bytes:
     if DIRECTORY_VARIABLE not in os.environ:
         return generate_latest(REGISTRY)
     registry = CollectorRegistry()
-    PlatformCollector(registry=registry)
     MultiProcessCollector(registry)  # type: ignore[no-untyped-call]
     return generate_latest(registry)
 
@@ -188,7 +152,3 @@ def forget_dead_workers() -> None:
             os.kill(pid, 0)
         except ProcessLookupError:
             mark_process_dead(pid)  # type: ignore[no-untyped-call]
-
-
-ProcessCollector(registry=REGISTRY)
-PlatformCollector(registry=REGISTRY)

@@ -9,19 +9,18 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import timedelta
 from pathlib import Path
-from typing import Any, Self
 
 import numpy as np
 from sqlalchemy import inspect, select
 from sqlalchemy.engine import Connection, make_url
 
-from api.http.errors import DatabaseAway, StartError
+from api.http.errors import StartError
 from api.settings import Settings
 from models.errors import ModelError
 from models.pack import ModelPack
 from templates.contract.document import Contract
 from templates.decoys import DecoyGenerator, DecoyPool, load_source
-from templates.errors import SealError, StoreUnavailable, VeilfaceError
+from templates.errors import SealError, VeilfaceError
 from templates.keys.sealing import KeyringSealer, MasterKeyring
 from templates.store import TemplateStore
 from templates.store.database import Database
@@ -39,18 +38,13 @@ def _start_error(sentence: str) -> Iterator[None]:
         yield
     except StartError:
         raise
-    except StoreUnavailable as error:
-        raise DatabaseAway(f"{sentence}: {error}") from None
     except (OSError, VeilfaceError, ModelError) as error:
         raise StartError(f"{sentence}: {error}") from None
 
 
 @dataclass(eq=False)
 class Deployment:
-    """What the files and the database of a deployment hold, without models.
-
-    The contract, the decoys on its axes, and the database at this program's schema.
-    """
+    """What the files and the database of a deployment hold, without models."""
 
     settings: Settings
     keyring: MasterKeyring
@@ -58,28 +52,20 @@ class Deployment:
     contract: Contract
     source: DecoyPool | DecoyGenerator
 
-    @classmethod
-    def open(cls, settings: Settings, *, contract: Contract | None = None) -> Self:
-        """Open what the settings name; ``contract`` is open already, if it is given.
-
-        The database comes last: it is not migrated for a service that does not start.
-        """
-        keyring = open_keyring(settings)
-        contract = contract or open_contract(settings, keyring)
-        more = cls._more(settings, contract)
-        source = open_decoys(settings, keyring, contract)
-        store = open_store(settings, keyring)
-        prepare_database(store)
-        return cls(settings, keyring, store, contract, source, **more)
-
-    @classmethod
-    def _more(cls, settings: Settings, contract: Contract) -> dict[str, Any]:  # noqa: ARG003
-        """Open what a subclass has beside this, by its fields."""
-        return {}
-
     def close(self) -> None:
         """Let go of the database's connections."""
         self.store.close()
+
+
+def open_deployment(settings: Settings, *, contract: Contract | None = None) -> Deployment:
+    """Open what the settings name; no query is sent to the database yet.
+
+    ``contract`` is given where the process that started this one has read the file.
+    """
+    keyring = open_keyring(settings)
+    contract = contract or open_contract(settings, keyring)
+    source = open_decoys(settings, keyring, contract)
+    return Deployment(settings, keyring, open_store(settings, keyring), contract, source)
 
 
 def file_sealer(keyring: MasterKeyring) -> KeyringSealer:
@@ -143,13 +129,10 @@ def database_in_use(url: str) -> bool:
 
 def key_beside_database(settings: Settings) -> str | None:
     """Say that the master key lies in the folder of an SQLite database, or None."""
-    if settings.master_key_variable is not None:
+    url, path = make_url(settings.resolved_database_url), settings.resolved_master_key_file
+    if url.get_backend_name() != "sqlite" or settings.master_key_variable is not None:
         return None
-    url = make_url(settings.resolved_database_url)
-    if url.get_backend_name() != "sqlite" or not url.database:
-        return None
-    path = settings.resolved_master_key_file
-    if Path(url.database).resolve().parent != path.resolve().parent:
+    if Path(url.database or "").resolve().parent != path.resolve().parent:
         return None
     return (
         f"the master key file {path} lies in the folder of the database, and so in every copy of "
@@ -214,20 +197,16 @@ def weak_privacy(contract: Contract) -> str | None:
     if contract.verdict is None:
         return "nobody measured what a thief of a template gets out of it"
     privacy = contract.verdict.privacy
+    rate = privacy.rate
     if privacy.status == "PASS":
         return None
-    within = privacy.rate.value <= privacy.limit
-    if within and privacy.shortfall is not None:
-        return privacy.shortfall
-    return (
-        f"a thief of a template gets a match for the face from {100 * privacy.rate.value:.3g} % of "
-        f"them ({privacy.rate.errors} of {privacy.rate.trials}), "
-        + (
-            f"which shows no more than that it is below {100 * (privacy.upper or 1.0):.3g} %"
-            if within
-            else f"and {100 * privacy.limit:.3g} % is the most that passes"
+    if rate.value > privacy.limit:
+        return (
+            f"a thief of a template gets a match for the face from {100 * rate.value:.3g} % of "
+            f"them ({rate.errors} of {rate.trials}), and {100 * privacy.limit:.3g} % is the most "
+            "that passes"
         )
-    )
+    return privacy.shortfall or f"{rate.trials} templates are too few to show it"
 
 
 def require_privacy(contract: Contract, settings: Settings) -> str | None:
@@ -288,7 +267,6 @@ def try_inference(pack: ModelPack) -> None:
     with _start_error(f"the pack {pack.info.name} fails on its first picture"):
         if pack.info.detector is not None:
             pack.detect(noise)
-        embedding = pack.embed(noise[None])
-    norm = float(np.linalg.norm(embedding))
-    if embedding.shape != (1, pack.info.n) or not abs(norm - 1.0) < 1e-3:
+        norm = float(np.linalg.norm(pack.embed(noise[None])))
+    if not abs(norm - 1.0) < 1e-3:
         raise StartError(f"the pack {pack.info.name} does not give a unit vector")

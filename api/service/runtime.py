@@ -5,19 +5,18 @@
     settings ─▶ open_keyring ─▶ open_store    ┐ enough for keys and db
                      └────────▶ open_contract ├─▶ Deployment ┐
                                 open_decoys   ┘              ├─▶ Runtime
-                                open_pack ───────────────────┘     .enroller / .verifier
+                                open_pack ───────────────────┘     .epoch: enroller, verifier
 """
 
-import contextlib
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Literal
+from typing import Literal, Self
 
 from api.http.errors import ApiError
 from api.http.policy import Levels, LivenessRules
 from api.http.transfer import Exported, ExportKey, seal_export
 from api.service.allocator import keep_few_arenas
-from api.service.opening import Deployment, open_pack
+from api.service.opening import Deployment, open_deployment, open_pack
 from api.service.served_graphs import served_graphs
 from api.service.stand_in import SealedStandIn
 from api.settings import Settings
@@ -26,26 +25,22 @@ from enroll.enroller import WIRE_DTYPE
 from models.pack import ModelPack
 from templates.contract import wire
 from templates.contract.document import Contract
-from templates.errors import StoreBusy
 from templates.keys.rotation import TenantRotation
 from templates.store.audit_log import By
 from templates.store.secrets import SecretName
 from templates.store.subject_rows import Source, SubjectTemplate
 from templates.store.subjects import Precondition, StoredTemplate
-from templates.store.tenants import RetiredRotation
 from verify import Verifier
-
-READS = 3
-"""Looks at a template whose rotation key may be dropped between the looks at the two."""
 
 TENANTS_KEPT = 64
 """Tenants and epochs whose rotations a process keeps."""
 
 
 @dataclass(frozen=True, eq=False)
-class InRotation:
-    """What works with the rotations of one tenant in one epoch."""
+class Epoch:
+    """One epoch of a tenant's rotations, and what works with them."""
 
+    number: int
     rotation: TenantRotation
     enroller: Enroller
     verifier: Verifier
@@ -56,9 +51,10 @@ class Runtime(Deployment):
     """Everything that answers a request, opened once in each process."""
 
     pack: ModelPack | None
-    operators_export_key: ExportKey | None
 
     def __post_init__(self) -> None:
+        file = self.settings.export_key_file
+        self._operators_export_key = None if file is None else ExportKey.from_file(file)
         self.levels = Levels(self.contract, lowest=self.settings.lowest_level)
         self.liveness = LivenessRules(self.settings.liveness, self.contract, self.pack)
         self.graphs = served_graphs(self.settings, self.pack)
@@ -66,59 +62,42 @@ class Runtime(Deployment):
         self.stand_in = SealedStandIn(
             self.nobody, self.keyring, contract_id=self.contract.contract_id
         )
-        self._of = lru_cache(TENANTS_KEPT)(self._in_rotation)
+        self.epoch = lru_cache(TENANTS_KEPT)(self._epoch)
 
     @classmethod
-    def _more(cls, settings: Settings, contract: Contract) -> dict[str, Any]:
+    def open(cls, settings: Settings, *, contract: Contract | None = None) -> Self:
+        """Open the deployment and its models (:func:`open_deployment`)."""
         keep_few_arenas(settings.resolved_compute_slots)
-        file = settings.export_key_file
-        return {
-            "pack": open_pack(settings, contract),
-            "operators_export_key": None if file is None else ExportKey.from_file(file),
-        }
+        deployment = open_deployment(settings, contract=contract)
+        return cls(**vars(deployment), pack=open_pack(settings, deployment.contract))
 
     @property
     def export_key(self) -> ExportKey:
         """The operator's key of exports, or else the deployment's own, as it is in force now."""
-        return self.operators_export_key or ExportKey.from_secret(
+        return self._operators_export_key or ExportKey.from_secret(
             self.store.secrets.get(SecretName.EXPORT)
         )
 
-    def epoch(self, tenant: str) -> int:
+    def current_epoch(self, tenant: str) -> Epoch:
         """Return the epoch that the tenant's new templates are in."""
-        return self.store.tenants.get(tenant).rotation_epoch
+        return self.epoch(tenant, self.store.tenants.get(tenant).rotation_epoch)
 
-    def enroller(self, tenant: str, epoch: int) -> Enroller:
-        """Return the tenant's enroller for one epoch."""
-        return self._of(tenant, epoch).enroller
+    def read(self, tenant: str, subject: str) -> tuple[SubjectTemplate, Epoch] | None:
+        """Return a subject's template and the epoch that it is in; None if there is none."""
+        template = self.store.subjects.get(tenant, subject)
+        if template is None:
+            return None
+        return template, self.epoch(tenant, template.record.rotation_epoch)
 
-    def verifier(self, tenant: str, epoch: int) -> Verifier:
-        """Return the tenant's verifier for one epoch."""
-        return self._of(tenant, epoch).verifier
-
-    def read(self, tenant: str, subject: str) -> tuple[SubjectTemplate, InRotation] | None:
-        """Return a subject's template and what works with its rotation; None if there is none."""
-        for _ in range(READS):
-            template = self.store.subjects.get(tenant, subject)
-            if template is None:
-                return None
-            with contextlib.suppress(RetiredRotation):
-                return template, self._of(tenant, template.record.rotation_epoch)
-            # Between the two looks it was moved into a newer epoch.
-        raise StoreBusy("the tenant's rotation is being renewed; send it again")
-
-    def _in_rotation(self, tenant: str, epoch: int) -> InRotation:
-        key = self.store.tenants.rotation_key(tenant, epoch=epoch).key
+    def _epoch(self, tenant: str, number: int) -> Epoch:
+        key = self.store.tenants.rotation_key(tenant, epoch=number).key
         rotation = TenantRotation(key, self.contract.binding.axes)
-        return InRotation(
-            rotation=rotation,
-            enroller=Enroller(
-                self.contract,
-                self.source,
-                rotation=rotation,
-                lift_secret=self.store.secrets.get(SecretName.LIFTS),
-            ),
-            verifier=Verifier(self.contract, self.source, rotation=rotation),
+        lift_secret = self.store.secrets.get(SecretName.LIFTS)
+        return Epoch(
+            number,
+            rotation,
+            Enroller(self.contract, self.source, rotation=rotation, lift_secret=lift_secret),
+            Verifier(self.contract, self.source, rotation=rotation),
         )
 
     def require_template_enrollment(self, tenant: str) -> None:
@@ -149,7 +128,7 @@ class Runtime(Deployment):
         self,
         tenant: str,
         subject: str,
-        epoch: int,
+        epoch: Epoch,
         enrollment: Enrollment,
         *,
         source: Source,
@@ -176,7 +155,7 @@ class Runtime(Deployment):
             photos=photos,
             template_id=enrollment.template_id,
             holder_salt=enrollment.holder_salt,
-            rotation_epoch=epoch,
+            rotation_epoch=epoch.number,
             precondition=precondition,
             action=action,
             token=token,
@@ -192,12 +171,12 @@ class Runtime(Deployment):
         read = self.read(tenant, subject)
         if read is None:
             return None
-        template, in_rotation = read
+        template, epoch = read
         binding = self.contract.binding
         contract_id = self.contract.contract_id
         binding.require_contract(template.record.contract_id, what="the stored template")
         stored = wire.decode(template.wire)
-        rotation = in_rotation.rotation.of(template.template_id)
+        rotation = epoch.rotation.of(template.template_id)
         plain = stored.subspace.turned_by(rotation.turned_back)
         exported = Exported(
             subject_id=subject,

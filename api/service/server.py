@@ -16,10 +16,10 @@ from typing import Any
 import uvicorn
 from fastapi import FastAPI
 from uvicorn.config import STARTUP_FAILURE
-from uvicorn.supervisors import Multiprocess, multiprocess
+from uvicorn.supervisors import Multiprocess
 
 from api.http.app import create_app
-from api.http.errors import DatabaseAway, StartError
+from api.http.errors import StartError
 from api.http.protocol import Protocol
 from api.service.logging import configure, log
 from api.service.metrics import shared_directory
@@ -32,8 +32,6 @@ GRACE_S = 20
 SIGN_OF_LIFE_S = 30
 """Seconds in which a worker must show that it lives; on a busy machine, uvicorn's five are few."""
 
-RETRY_S = 2.0
-"""Between two looks of a worker for a database that is away."""
 BACKLOG = 2048
 CIPHERS = "ECDHE+AESGCM:ECDHE+CHACHA20"
 """Of TLS 1.2: forward secrecy and authenticated encryption. Those of TLS 1.3 are all like that."""
@@ -75,58 +73,15 @@ class _Workers(Multiprocess):
         super().terminate_all()
 
 
-class _Worker(multiprocess.Process):
-    """uvicorn's worker, which alone holds its end of the pipe that asks for a sign of life.
-
-    The first process would otherwise wait for a dead worker's answer for all of the time that a
-    living one has, deaf to other deaths and to the signal to stop.
-    """
-
-    def start(self) -> None:
-        """Start the process, and let go of its end."""
-        super().start()
-        self.child_conn.close()
-
-
-# What uvicorn's supervisor calls for a worker.
-multiprocess.Process = _Worker  # type: ignore[misc]
-
-
 def _worker_app(settings: Settings, contract: Contract) -> FastAPI:
     """Make a worker's application; the worker ends with the process that started it.
 
     It would hold the port otherwise, and a service that is started again could not listen.
     """
-    configure(settings.log_level)
     parent = multiprocessing.parent_process()
     assert parent is not None  # noqa: S101 - uvicorn starts workers as processes
     threading.Thread(target=_end_after, args=(parent,), daemon=True).start()
-    stopping = threading.Event()
-    handle = signal.getsignal(signal.SIGTERM)
-
-    def stop(number: int, frame: Any) -> None:
-        stopping.set()
-        if callable(handle):
-            handle(number, frame)
-
-    signal.signal(signal.SIGTERM, stop)
-    opening = partial(open_patiently, contract=contract, stopping=stopping)
-    return create_app(settings, open_runtime=opening)
-
-
-def open_patiently(settings: Settings, *, contract: Contract, stopping: threading.Event) -> Runtime:
-    """Open the deployment; wait for a database that is away until ``stopping`` is set.
-
-    A worker in place of one that died does so: the others serve on, and say ``store_unavailable``,
-    where one that could not start would stop them all.
-    """
-    while True:
-        try:
-            return Runtime.open(settings, contract=contract)
-        except DatabaseAway as error:
-            log(f"the worker waits: {error}", severity=logging.WARNING, pid=os.getpid())
-            if stopping.wait(RETRY_S):
-                raise
+    return create_app(settings, open_runtime=partial(Runtime.open, contract=contract))
 
 
 def _end_after(parent: multiprocessing.process.BaseProcess) -> None:
@@ -189,14 +144,12 @@ def tls_options(settings: Settings) -> dict[str, Any]:
                 f"the file of tls_key may be read by others (mode {mode:04o}): `chmod 600` it, "
                 "and replace the key if others could have read it"
             )
-        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         # A password must not be asked for on a terminal: there may be none.
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         context.load_cert_chain(certificate, key, password=lambda: "")
-    except FileNotFoundError as error:
-        raise StartError("tls_certificate and tls_key must name files that exist") from error
     except (OSError, ValueError) as error:
         raise StartError(
-            "tls_certificate and tls_key cannot be used: they must be PEM files that belong "
-            "together, the key without a password"
+            "tls_certificate and tls_key cannot be used: they must be PEM files that exist and "
+            "belong together, the key without a password"
         ) from error
     return {"ssl_certfile": certificate, "ssl_keyfile": key, "ssl_ciphers": CIPHERS}

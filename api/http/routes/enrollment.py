@@ -64,14 +64,13 @@ async def enroll(
             if token is not None:
                 # Once more: the body and the turn to compute may have taken a while.
                 token.require_in_time()
-            epoch = runtime.epoch(tenant)
-            enroller, key = runtime.enroller(tenant, epoch), sent.holder_key
+            epoch, key = runtime.current_epoch(tenant), sent.holder_key
             holder = None if key is None else Holder(key, tenant, subject)
             try:
                 if isinstance(sent, EnrollmentJson):
-                    enrollment = enroller.from_template(sent.template, holder=holder)
+                    enrollment = epoch.enroller.from_template(sent.template, holder=holder)
                 else:
-                    enrollment = enroller.from_photos(
+                    enrollment = epoch.enroller.from_photos(
                         runtime.required_pack(),
                         sent.images,
                         attributes=sent.attributes,

@@ -11,7 +11,7 @@ from api.http.deps import has_copy
 from api.http.errors import ApiError
 from api.http.schemas import PackAnswer, PackFileEntry
 from api.http.tokens import SubjectToken
-from api.service.served_graphs import licence_of
+from models.known_packs import KNOWN_PACKS
 
 router = APIRouter(prefix="/v1/pack", tags=["Tokens"])
 
@@ -46,17 +46,18 @@ async def list_pack(call: AnyCall) -> PackAnswer:
     pack, graphs = call.runtime.pack, call.runtime.graphs
     if pack is None or not graphs:
         raise _not_served()
+    known = KNOWN_PACKS.get(pack.info.name.lower())
     return PackAnswer(
         name=pack.info.name,
-        licence=licence_of(pack),
+        licence=None if known is None else known.licence,
         contract_id=call.runtime.contract.contract_id,
         files=[
             PackFileEntry(
                 role=graph.role,
                 kind=graph.kind,
-                file=graph.file,
+                file=graph.path.name,
                 sha256=graph.sha256,
-                bytes=graph.size,
+                bytes=graph.path.stat().st_size,
                 path=f"{call.request.scope['root_path']}{router.prefix}/{graph.sha256}",
                 input_size=list(graph.input_size),
             )
@@ -96,7 +97,6 @@ async def get_pack_file(
     headers = {"ETag": f'"{graph.sha256}"', "Cache-Control": KEPT}
     if has_copy(call.request, headers["ETag"]):
         return Response(status_code=304, headers=headers)
-    graph.require_unchanged()
     headers["Accept-Ranges"] = "none"
     return _WholeFile(graph.path, media_type="application/octet-stream", headers=headers)
 

@@ -98,13 +98,11 @@ async def compare(call: Verifies) -> VerifyAnswer:
 def _decide(call: Call, sent: CompareForm, level: str) -> Decision:
     """Enroll the first photo in memory, decide the second by it, and write the audit log's line."""
     runtime, pack = call.runtime, call.runtime.required_pack()
-    passive, epoch = runtime.liveness.policy.passive, runtime.epoch(call.tenant)
+    passive, epoch = runtime.liveness.policy.passive, runtime.current_epoch(call.tenant)
     first, second = sent.images
     with step("photo"):
         with _position(0):
-            template = runtime.enroller(call.tenant, epoch).from_photos(
-                pack, [first], policy=sent.face
-            )
+            template = epoch.enroller.from_photos(pack, [first], policy=sent.face)
         with _position(1):
             probe = probe_of_photos(
                 pack,
@@ -114,8 +112,7 @@ def _decide(call: Call, sent: CompareForm, level: str) -> Decision:
                 policy=sent.face,
             )
     with step("decide"):
-        verifier = runtime.verifier(call.tenant, epoch)
-        decision = verifier.decide_embedding(probe.embedding, template, level=level)
+        decision = epoch.verifier.decide_embedding(probe.embedding, template, level=level)
     if passive:
         decision = decision.with_liveness(probe.failure)
     outcome = "accept" if decision.accepted else "reject"

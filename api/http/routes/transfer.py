@@ -71,15 +71,13 @@ async def import_subject(
         call.note_subject(checked_subject_id(exported.subject_id))
 
         def work() -> ImportAnswer:
-            epoch = runtime.epoch(call.tenant)
-            enroller = runtime.enroller(call.tenant, epoch)
-            salt = exported.holder_salt
+            epoch, salt = runtime.current_epoch(call.tenant), exported.holder_salt
             # A template that the service made of photos is no client's. One that is in a holder's
             # rotation cannot be held against strangers: it was when it was enrolled.
             if exported.source == Source.PHOTOS or salt is not None:
-                enrollment = enroller.from_export(exported.wire, holder_salt=salt)
+                enrollment = epoch.enroller.from_export(exported.wire, holder_salt=salt)
             else:
-                enrollment = enroller.from_template(exported.wire)
+                enrollment = epoch.enroller.from_template(exported.wire)
 
             stored = runtime.put(
                 call.tenant,

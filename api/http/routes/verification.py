@@ -31,7 +31,7 @@ from api.http.openapi import body_of
 from api.http.requests import VerifyForm, VerifyJson
 from api.http.routes.challenges import Challenge, opened_challenge
 from api.http.schemas import VerifyAnswer
-from api.service.metrics import count_decision, step
+from api.service.metrics import DECISIONS, step
 from api.service.runtime import Runtime
 from templates.errors import ContractMismatch
 from templates.keys.holder_key import wipe
@@ -115,9 +115,7 @@ def answer_of(call: Call, decision: Decision, *, probe: str) -> VerifyAnswer:
     call.request.state.log.update(
         security_level=decision.level, decision=answer.decision, liveness=answer.liveness
     )
-    count_decision(
-        accepted=decision.accepted, reason=decision.reason, level=decision.level, probe=probe
-    )
+    DECISIONS.labels(answer.decision, answer.reason, answer.level, probe).inc()
     return answer
 
 
@@ -172,7 +170,7 @@ def _decide(
             raise _why_not(runtime, call.tenant, subject)
         stored = template or runtime.stand_in.open()
         probe = probe_of()
-        verifier = runtime.verifier(call.tenant, epoch)
+        verifier = runtime.epoch(call.tenant, epoch).verifier
         with step("decide"):
             if isinstance(probe, bytes):
                 return verifier.decide_template(

@@ -76,7 +76,7 @@ def test_every_exception_of_the_packages_has_a_code() -> None:
 
     # Raised before there is a server, or by packages that requests do not reach.
     elsewhere = {
-        *("DatabaseAway", "DatasetError", "CacheError", "AlignmentError", "PreparationError"),
+        *("StartError", "DatasetError", "CacheError", "AlignmentError", "PreparationError"),
         *("EvaluationError", "ClusterError", "AuditError"),
     }
     for root in (template_errors.VeilfaceError, model_errors.ModelError):

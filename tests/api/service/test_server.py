@@ -2,7 +2,6 @@
 
 import signal
 import socket
-import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -10,10 +9,11 @@ from pathlib import Path
 import httpx
 import pytest
 
-from api.http.errors import DatabaseAway
-from api.service.server import RETRY_S, open_patiently
+from api.http.app import create_app
+from tests.api.client import Client
 from tests.api.deployment import bearer, deploy, images, photo
 from tests.api.server_process import Server
+from tests.api.shapes import assert_error
 from tests.patience import PATIENCE_S, wait_until
 from tests.ports import free_port
 
@@ -114,16 +114,12 @@ def test_stopping_finishes_what_runs_and_logs_only_json(server: Server) -> None:
     assert server.deployment.token not in server.log.read_text()
 
 
-def test_a_worker_waits_for_a_database_that_is_away(tmp_path: Path) -> None:
-    """Until it is told to stop; one that could not start would stop the workers beside it."""
+def test_a_worker_starts_while_the_database_is_away(tmp_path: Path) -> None:
+    """It says so; one that could not start would stop the workers beside it."""
     deployment = deploy(tmp_path)
     nobody = f"postgresql+psycopg://veilface@127.0.0.1:{free_port()}/veilface"
     away = deployment.settings.model_copy(update={"database_url": nobody})
-    stopping = threading.Event()
-    with ThreadPoolExecutor(1) as pool:
-        opening = pool.submit(open_patiently, away, contract=deployment.contract, stopping=stopping)
-        with pytest.raises(TimeoutError):
-            opening.result(timeout=3 * RETRY_S)
-        stopping.set()
-        with pytest.raises(DatabaseAway):
-            opening.result(timeout=PATIENCE_S)
+    with Client(create_app(away), headers=bearer(deployment.token)) as client:
+        for path in ("/health/ready", "/v1/contract"):
+            assert_error(client.get(path), 503, "store_unavailable")
+        assert client.get("/health/live").status_code == 200

@@ -20,6 +20,7 @@ from api.service.opening import (
     file_sealer,
     open_keyring,
     open_store,
+    prepare_database,
     try_inference,
 )
 from api.service.runtime import Runtime
@@ -59,7 +60,7 @@ def changed(deployment: Deployment, **changes: Any) -> Settings:
 
 def refused(settings: Settings) -> str:
     with pytest.raises(StartError) as caught:
-        Runtime.open(settings)
+        prepare_database(Runtime.open(settings).store)
     sentence = str(caught.value)
     assert "\n" not in sentence
     assert "Traceback" not in sentence
