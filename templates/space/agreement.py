@@ -58,7 +58,10 @@ def _listed(positions: Sequence[int], names: Sequence[str] | None) -> str:
 
 def distinct_rows(rows: NDArray[np.floating]) -> list[int]:
     """Return the positions of rows that repeat no earlier one, ascending, of (k, n)."""
-    return sorted(np.unique(rows, axis=0, return_index=True)[1].tolist())
+    first: dict[bytes, int] = {}
+    for place, row in enumerate(rows):
+        first.setdefault(row.tobytes(), place)
+    return list(first.values())
 
 
 def mean_embedding(rows: NDArray[np.float32], *, consistency: float) -> NDArray[np.float32]:
