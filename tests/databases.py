@@ -106,6 +106,15 @@ def migrate_ahead(url: str) -> None:
         path.write_bytes(_migrated())
 
 
+def execute(database: Database, *statements: Any, **values: object) -> list[Any]:
+    """Run statements in one write, as an attacker or another program; the last one's rows."""
+    with database.write() as session:
+        for statement in statements:
+            text = sa.text(statement) if isinstance(statement, str) else statement
+            result: Any = session.execute(text, values)
+        return list(result) if getattr(result, "returns_rows", True) else []
+
+
 @functools.cache
 def _migrated() -> bytes:
     with tempfile.TemporaryDirectory() as folder:

@@ -506,7 +506,7 @@ def _compact(traces: ServiceTraces) -> None:
         traces.database_url, MasterKeyring.load(traces.folder / "data" / "master.key")
     )
     try:
-        store.compact()
+        store.database.compact()
     finally:
         store.close()
     if not traces.files_hidden:

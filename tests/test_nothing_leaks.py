@@ -108,7 +108,7 @@ def in_sqlite_row(traces: ServiceTraces, payload: bytes, folder: Path) -> bytes:
     copy.write_bytes(traces.stopped["data/veilface.db"])
     with sqlite3.connect(copy) as connection:
         connection.execute("PRAGMA journal_mode = DELETE")
-        connection.execute("UPDATE templates SET ciphertext = ?", (payload,))
+        connection.execute("UPDATE subjects SET ciphertext = ?", (payload,))
     connection.close()
     return copy.read_bytes()
 
@@ -127,7 +127,7 @@ def in_sqlite_log(traces: ServiceTraces, payload: bytes, folder: Path) -> bytes:
 
 def in_postgres_row(traces: ServiceTraces, payload: bytes, folder: Path) -> bytes:
     with psycopg.connect(traces.database_url) as connection:
-        connection.execute("UPDATE templates SET ciphertext = %s", (payload,))
+        connection.execute("UPDATE subjects SET ciphertext = %s", (payload,))
         rows = b"".join(copied_tables(connection).values())
         connection.rollback()
     return rows

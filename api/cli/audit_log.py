@@ -60,8 +60,8 @@ def verify(
         checked_store(settings) as store,
         progress("verifying the audit log", None) as advance,
     ):
-        report, records = store.verify_audit_log(anchor=kept, progress=advance)
-    problem, intact = report.problem, report.intact and not records
+        report = store.verify_audit_log(anchor=kept, progress=advance)
+    problem, records, intact = report.problem, report.records, report.intact
     facts = {
         "intact": intact,
         "lines": report.lines,
@@ -82,7 +82,7 @@ def verify(
         message(f"{record.about}: {record.what}")
     if len(records) > PROBLEMS_SHOWN:
         message(f"… and {len(records) - PROBLEMS_SHOWN} more")
-    what = "the audit log was" if not report.intact else "records of the database were"
+    what = "the audit log was" if problem is not None else "records of the database were"
     return Result(facts, error=f"{what} tampered with, or damaged")
 
 

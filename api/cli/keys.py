@@ -205,7 +205,8 @@ def rotate_tenant(
             epoch = rotations.begin(tenant, by=operator())
         moved = 0
         if binding is not None:
-            with progress("turning templates", rotations.remaining(tenant)) as advance:
+            older = len(rotations.subjects_of_old_epochs(tenant))
+            with progress("turning templates", older) as advance:
                 moved = rotations.move(tenant, binding, by=operator(), progress=advance)
         left = rotations.subjects_of_old_epochs(tenant)
         dropped = 0 if left else rotations.retire(tenant, by=operator())

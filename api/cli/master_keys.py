@@ -181,7 +181,8 @@ def add_key(settings: Settings, store: TemplateStore) -> None:
     In a write, so that of two rotations at once neither takes the other's key out of the file.
     """
     path = settings.resolved_master_key_file
-    store.database.write(lambda _: MasterKeyring.add_current(path))
+    with store.database.write():
+        MasterKeyring.add_current(path)
 
 
 @dataclass(frozen=True)
@@ -218,7 +219,8 @@ def retire_older(settings: Settings, store: TemplateStore, done: Rewrapped) -> R
             "again before retiring it"
         )
     path = settings.resolved_master_key_file
-    dropped = store.database.write(lambda _: MasterKeyring.drop_retired(path, keep=done.key_id))
+    with store.database.write():
+        dropped = MasterKeyring.drop_retired(path, keep=done.key_id)
     return replace(done, retired=dropped)
 
 

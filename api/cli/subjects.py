@@ -27,7 +27,7 @@ from templates.errors import StoreBusy, StoreUnavailable, VeilfaceError
 from templates.space.agreement import InconsistentImages
 from templates.store.audit_log import Entry
 from templates.store.identifiers import checked_subject_id
-from templates.store.subject_rows import Source
+from templates.store.schema import Source
 from verify import MAX_PROBE_PHOTOS, probe_of_photos
 
 Subject = Annotated[str, typer.Argument(help="Id of the person.")]

@@ -47,10 +47,7 @@ def read_stored(folder: Path, names: Sequence[str]) -> tuple[Stored, ...]:
             subject = store.subjects.get(TENANT, name)
             if subject is None:
                 continue
-            query = (
-                "SELECT t.ciphertext FROM templates t JOIN subjects s ON s.id = t.subject_pk "
-                "WHERE s.subject_id = ?"
-            )
+            query = "SELECT ciphertext FROM subjects WHERE subject_id = ?"
             ciphertext = bytes(_value(folder, query, name))
             # From the middle: away from the header and the authentication tag.
             start = (len(ciphertext) - _EXCERPT) // 2

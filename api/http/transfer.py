@@ -21,7 +21,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from api.http.errors import StartError
 from templates.errors import ContractMismatch, InvalidTemplate, SealError
 from templates.keys.sealing import MasterKeyring
-from templates.store.subject_rows import Source
+from templates.store.schema import Source
 
 MAGIC = b"VEILEXP1"
 CONTRACT_ID_BYTES = 32

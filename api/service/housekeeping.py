@@ -30,11 +30,10 @@ async def purge_regularly(
     """
 
     def purge() -> None:
-        if not keep.keeps_all:
-            # Before the rest: it is emptied from the log of the same round.
-            erased = store.retention.erase_expired(keep)
-            if erased:
-                log("retention erased subjects", subjects=erased)
+        # Before the rest: it is emptied from the log of the same round.
+        erased = store.retention.erase_expired(keep)
+        if erased:
+            log("retention erased subjects", subjects=erased)
         if not store.purge():
             log(
                 "a reader of the database keeps its write-ahead log, with what was removed: it is "

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 from sqlalchemy import inspect, select
-from sqlalchemy.engine import Connection, make_url
+from sqlalchemy.engine import make_url
 
 from api.http.errors import StartError
 from api.settings import Settings
@@ -115,14 +115,10 @@ def database_in_use(url: str) -> bool:
     if url.startswith("sqlite") and not Path(make_url(url).database or "").exists():
         return False
     database = Database(url)
-
-    def marked(connection: Connection) -> bool:
-        if not inspect(connection).has_table(SecretRow.__tablename__):
-            return False
-        return connection.execute(select(SecretRow.name).limit(1)).first() is not None
-
     try:
-        return database.read(marked)
+        with database.read() as session:
+            has_table = inspect(session.connection()).has_table(SecretRow.__tablename__)
+            return has_table and session.scalar(select(SecretRow.name).limit(1)) is not None
     finally:
         database.close()
 

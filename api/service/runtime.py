@@ -27,9 +27,9 @@ from templates.contract import wire
 from templates.contract.document import Contract
 from templates.keys.rotation import TenantRotation
 from templates.store.audit_log import By
+from templates.store.schema import Source
 from templates.store.secrets import SecretName
-from templates.store.subject_rows import Source, SubjectTemplate
-from templates.store.subjects import Precondition, StoredTemplate
+from templates.store.subjects import Precondition, StoredTemplate, SubjectTemplate
 from verify import Verifier
 
 TENANTS_KEPT = 64

@@ -8,7 +8,8 @@ from templates.contract.nobody import Nobody
 from templates.errors import SealError
 from templates.keys.randomness import Keystream
 from templates.keys.sealing import MasterKeyring
-from templates.store.envelope import Envelope, Owner, close_envelope, open_envelope
+from templates.store.envelope import open_template, seal_template
+from templates.store.schema import SubjectRow
 from verify import StandIn
 
 
@@ -20,20 +21,18 @@ class SealedStandIn:
         lifted = nobody.lift(stream)
         self._wire = wire.encode(lifted, contract_id=contract_id, dtype=WIRE_DTYPE)
         self._keyring = keyring
-        self._owner = Owner("", "stand-in", "", contract_id, "", 0)
-        self._sealed = self._seal()
+        self._subject = SubjectRow(id="stand-in", tenant_id="", subject_id="", template_id="")
+        self._subject.contract_id, self._subject.rotation_epoch = contract_id, 0
+        seal_template(self._subject, self._wire, keyring)
 
     def open(self) -> StandIn:
         """Decrypt it."""
         try:
-            return StandIn(open_envelope(self._sealed, self._owner, self._keyring))
+            return StandIn(open_template(self._subject, self._keyring))
         except SealError:
             # The master key that it was sealed with was retired since.
-            self._sealed = self._seal()
-            return StandIn(open_envelope(self._sealed, self._owner, self._keyring))
-
-    def _seal(self) -> Envelope:
-        return close_envelope(self._wire, self._owner, self._keyring)
+            seal_template(self._subject, self._wire, self._keyring)
+            return StandIn(open_template(self._subject, self._keyring))
 
     def __repr__(self) -> str:
         return "SealedStandIn()"

@@ -13,7 +13,7 @@ from templates.store.lockout import AttemptsStatus, LockedOut, LockoutPolicy, Re
 from templates.store.receipts import Receipt, verify_receipt
 from templates.store.repository import TemplateStore
 from templates.store.retention import Retention
-from templates.store.subject_rows import Source
+from templates.store.schema import Source
 from templates.store.subjects import StoredTemplate
 from templates.store.tenants import RetiredRotation
 

@@ -21,7 +21,7 @@ from enum import StrEnum
 from typing import Any
 
 import sqlalchemy as sa
-from sqlalchemy.engine import Connection
+from sqlalchemy.orm import Session
 
 from templates.contract.levels import LEVEL_NAME
 from templates.errors import StoreError
@@ -119,7 +119,8 @@ class ApiKeys:
             expires_at=expires_at,
             lowest_level=lowest_level,
         )
-        return self._context.database.write(lambda connection: self._insert(connection, key, by))
+        with self._context.database.write() as session:
+            return self._insert(session, key, by)
 
     def verify(self, token: str) -> ApiKey | None:
         """Return the key of a token, or None if it is unknown, wrong, expired or revoked.
@@ -149,15 +150,13 @@ class ApiKeys:
         query = _KEYS.order_by(ApiKeyRow.created_at, ApiKeyRow.prefix)
         if tenant is not None:
             query = query.where(TenantRow.name == tenant)
-        return self._context.database.read(lambda connection: self._read_all(connection, query))
+        with self._context.database.read() as session:
+            return self.read_all(session, query)
 
-    def read_all(self, connection: Connection) -> tuple[ApiKey, ...]:
-        """Every key, inside a transaction."""
-        return self._read_all(connection, _KEYS)
-
-    def _read_all(self, connection: Connection, query: Any) -> tuple[ApiKey, ...]:
+    def read_all(self, session: Session, query: Any = None) -> tuple[ApiKey, ...]:
+        """Every key that a query finds, by default every one."""
         with _unreadable_is_altered():
-            rows = connection.execute(query).all()
+            rows = session.execute(_KEYS if query is None else query).all()
         return tuple(self._read(row) for row in rows)
 
     def revoke(self, prefix: str, *, by: By = PROGRAM) -> bool:
@@ -165,33 +164,27 @@ class ApiKeys:
 
         An unknown prefix does not get into the audit log: it may be a token that was taken for one.
         """
-
-        def work(connection: Connection) -> bool:
-            row = connection.execute(_OF_PREFIX, {"prefix": prefix}).one_or_none()
+        with self._context.database.write() as session:
+            row = session.execute(_OF_PREFIX, {"prefix": prefix}).one_or_none()
             if row is None:
                 entry = Entry("key-revoke", "unknown_key", by)
             elif row.revoked_at is not None:
                 entry = Entry("key-revoke", "revoked_before", by, row.tenant, detail=prefix)
             else:
                 entry = Entry("key-revoke", "revoked", by, row.tenant, detail=prefix)
-                self._revoke(connection, row)
-            self._context.audit_log.append(connection, entry)
-            return entry.outcome == "revoked"
+                self._revoke(session, row)
+            self._context.audit_log.append(session, entry)
+        return entry.outcome == "revoked"
 
-        return self._context.database.write(work)
-
-    def authenticate_again(self, connection: Connection, secret: bytes) -> tuple[str, ...]:
+    def authenticate_again(self, session: Session, secret: bytes) -> tuple[str, ...]:
         """Give every authentic key a MAC under a new secret, in a write.
 
         Returns the prefixes of the others, which are good for nothing from then on.
         """
         refused = []
-        rows: Any = connection.execute(_KEYS).all()
-        for row in rows:
+        for row in session.execute(_KEYS).all():
             if self._is_authentic(row):
-                mac = _mac(secret, row._mapping)
-                statement = sa.update(ApiKeyRow).where(ApiKeyRow.prefix == row.prefix)
-                connection.execute(statement.values(mac=mac))
+                _update(session, row.id, mac=_mac(secret, row._asdict()))
             else:
                 refused.append(row.prefix)
         return tuple(refused)
@@ -204,17 +197,13 @@ class ApiKeys:
         now = self._context.clock()
         if key.last_used_at is not None and key.last_used_at > now - _USE_IS_NOTED_EVERY:
             return
-        statement = sa.update(ApiKeyRow).where(ApiKeyRow.id == key.id).values(last_used_at=now)
-        with contextlib.suppress(StoreError):
-            self._context.database.write(
-                lambda connection: connection.execute(statement), wait=_NOTE_WAIT_S
-            )
+        database = self._context.database
+        with contextlib.suppress(StoreError), database.write(wait=_NOTE_WAIT_S) as session:
+            _update(session, key.id, last_used_at=now)
 
     def _row(self, prefix: str) -> Any:
-        with _unreadable_is_altered():
-            return self._context.database.read(
-                lambda connection: connection.execute(_OF_PREFIX, {"prefix": prefix}).one_or_none()
-            )
+        with _unreadable_is_altered(), self._context.database.read() as session:
+            return session.execute(_OF_PREFIX, {"prefix": prefix}).one_or_none()
 
     def _valid(self, row: Any) -> ApiKey | None:
         if row is None:
@@ -237,29 +226,28 @@ class ApiKeys:
         expected = _mac(self._context.secrets.get(SecretName.API_KEYS), row._mapping)
         return hmac.compare_digest(expected, row.mac)
 
-    def _insert(self, connection: Connection, key: ApiKey, by: By) -> NewApiKey:
+    def _insert(self, session: Session, key: ApiKey, by: By) -> NewApiKey:
         token = f"vf_{key.prefix}_{os.urandom(32).hex()}"
         row: dict[str, Any] = {
             **{name: getattr(key, name) for name in _FIELDS - {"tenant"}},
-            "tenant_id": tenant_of(connection, key.tenant).id,
+            "tenant_id": tenant_of(session, key.tenant).id,
             "token_hash": _token_hash(token),
             "rights": ",".join(sorted(key.rights)),
         }
         secret = self._context.secrets.get(SecretName.API_KEYS)
         row["mac"] = _mac(secret, {**row, "tenant": key.tenant})
-        connection.execute(sa.insert(ApiKeyRow).values(row))
+        session.add(ApiKeyRow(**row))
         entry = Entry("key-create", "created", by, key.tenant, detail=key.prefix)
-        self._context.audit_log.append(connection, entry)
+        self._context.audit_log.append(session, entry)
         return NewApiKey(key=key, token=token)
 
-    def _revoke(self, connection: Connection, row: Any) -> None:
+    def _revoke(self, session: Session, row: Any) -> None:
         """Note the moment in a row; one that is not authentic stays so."""
         columns: dict[str, Any] = {"revoked_at": self._context.clock()}
         if self._is_authentic(row):
             secret = self._context.secrets.get(SecretName.API_KEYS)
             columns["mac"] = _mac(secret, {**row._mapping, **columns})
-        statement = sa.update(ApiKeyRow).where(ApiKeyRow.prefix == row.prefix)
-        connection.execute(statement.values(columns))
+        _update(session, row.id, **columns)
 
 
 _AUTHENTICATED = (
@@ -291,6 +279,10 @@ def _unreadable_is_altered() -> Iterator[None]:
         raise StoreError(
             "a row of the API keys was altered: run `veilface audit-log verify`"
         ) from None
+
+
+def _update(session: Session, key_id: str, **columns: Any) -> None:
+    session.execute(sa.update(ApiKeyRow).where(ApiKeyRow.id == key_id).values(columns))
 
 
 def _mac(secret: bytes, values: Mapping[str, Any]) -> bytes:

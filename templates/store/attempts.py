@@ -14,15 +14,14 @@ import contextlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import timedelta
-from functools import partial
-from typing import Any, Protocol, TypeVar, cast
+from typing import Any, Protocol, TypeVar
 
 import sqlalchemy as sa
-from sqlalchemy.engine import Connection
-from sqlalchemy.orm import aliased
+from sqlalchemy.orm import Session, aliased
 
 from templates.store.audit_log import By, Entry
 from templates.store.context import StoreContext
+from templates.store.database import delete
 from templates.store.identifiers import UnknownTenant, checked_subject_id
 from templates.store.lockout import (
     AttemptsStatus,
@@ -31,14 +30,8 @@ from templates.store.lockout import (
     Replayed,
     Superseded,
 )
-from templates.store.schema import (
-    AuditRow,
-    FailedAttemptsRow,
-    SubjectRow,
-    TemplateRow,
-    TenantRow,
-)
-from templates.store.subject_rows import TEMPLATE_COLUMNS, SubjectTemplate, opened_template
+from templates.store.schema import SEALED, AuditRow, FailedAttemptsRow, SubjectRow, TenantRow
+from templates.store.subjects import SubjectTemplate, opened_template
 from templates.store.tenants import RetiredRotation
 
 COUNT_RETENTION = timedelta(days=90)
@@ -125,23 +118,21 @@ class Attempts:
         SealError
             If the row was altered or moved, or its master key is missing.
         """
-        parameters = self._parameters(tenant, subject_id, token=token, contract_id=contract_id)
-        database, read = self._context.database, partial(self._read, parameters)
-        record = partial(self._record, parameters, by)
-
-        def decide_in_write(connection: Connection) -> tuple[D, LockedOut | Replayed | None]:
-            attempt = read(connection)
-            decided = compare(attempt)
-            return decided, record(attempt, decided, connection)
-
+        probe = self._parameters(tenant, subject_id, token=token, contract_id=contract_id)
+        database = self._context.database
         for _ in range(TRIES):
             with contextlib.suppress(Superseded, RetiredRotation):
-                attempt = database.read(read)
+                with database.read() as session:
+                    attempt = self._read(session, probe)
                 decided = compare(attempt)
-                refusal = database.write(partial(record, attempt, decided))
+                with database.write() as session:
+                    refusal = self._record(session, probe, attempt, decided, by)
                 break
         else:
-            decided, refusal = database.write(decide_in_write)
+            with database.write() as session:
+                attempt = self._read(session, probe)
+                decided = compare(attempt)
+                refusal = self._record(session, probe, attempt, decided, by)
         if refusal is not None:
             raise refusal
         return decided
@@ -149,113 +140,106 @@ class Attempts:
     def reset(self, tenant: str, subject_id: str, *, by: By) -> bool:
         """Forget the consecutive failures on a subject, its lock and its being disabled.
 
-        Returns
-        -------
-        bool
-            False if there was none of these. The total stays.
+        False if there was none of these. The total stays.
         """
-        parameters = self._parameters(tenant, subject_id)
-
-        def work(connection: Connection) -> bool:
-            row = _row_of(connection, RECORD_QUERY, parameters)
-            status = self._status(row)
-            lifts = status is not None and not status.is_clear
-            if status is not None and lifts:
-                _write_counts(connection, row, parameters["pseudonym"], status.cleared())
+        probe = self._parameters(tenant, subject_id)
+        with self._context.database.write() as session:
+            counts = _state_of(session, _STATE, probe).FailedAttemptsRow
+            lifts = counts is not None and counts.consecutive > 0
+            if lifts:
+                counts.consecutive = 0
             outcome = "reset" if lifts else "nothing_held"
-            entry = Entry("lockout-reset", outcome, by, tenant, parameters["pseudonym"])
-            self._context.audit_log.append(connection, entry)
+            entry = Entry("lockout-reset", outcome, by, tenant, probe["pseudonym"])
+            self._context.audit_log.append(session, entry)
             return lifts
-
-        return self._context.database.write(work)
 
     def status(self, tenant: str, subject_id: str) -> AttemptsStatus | None:
         """What is counted of a subject; None if no attempt on it ever failed."""
-        parameters = self._parameters(tenant, subject_id)
-        row = self._context.database.read(
-            lambda connection: _row_of(connection, RECORD_QUERY, parameters)
-        )
-        return self._status(row)
+        probe = self._parameters(tenant, subject_id)
+        with self._context.database.read() as session:
+            return self._status(_state_of(session, _STATE, probe).FailedAttemptsRow)
 
     def expire(self) -> int:
         """Remove the counts of subjects that did not fail for ninety days; returns how many."""
         due = FailedAttemptsRow.last_failed_at <= self._context.clock() - COUNT_RETENTION
         if self._policy.after:
             due &= FailedAttemptsRow.consecutive < self._policy.disable_at
-        database = self._context.database
-        # Read first: a round that has nothing to remove, and most have not, waits for no write.
-        some = sa.select(FailedAttemptsRow.pseudonym).where(due).limit(1)
-        if database.read(lambda connection: connection.execute(some).first()) is None:
-            return 0
-        statement = sa.delete(FailedAttemptsRow).where(due)
-        return database.write(lambda connection: connection.execute(statement).rowcount)
+        with self._context.database.write() as session:
+            return delete(session, FailedAttemptsRow, due)
 
-    def _read(self, parameters: Mapping[str, Any], connection: Connection) -> Attempt:
+    def _read(self, session: Session, probe: Mapping[str, Any]) -> Attempt:
         """Read all that a decision needs, and refuse early what :meth:`_record` would refuse.
 
         One query, and as many bytes, whether the subject is enrolled or not.
         """
-        row = _row_of(connection, DECISION_QUERY, parameters)
-        if row.is_used:
-            raise Replayed
-        self._policy.refuse_locked(self._status(row), self._context.clock())
-        template = None
-        if row.template_id is not None:
-            template = opened_template(row, self._context.keyring)
-        return Attempt(rotation_epoch=row.current_epoch, template=template)
+        state = _state_of(session, DECISION_QUERY, probe)
+        if (refusal := self._refusal(state)) is not None:
+            raise refusal
+        subject, template = state.SubjectRow, None
+        if subject is not None:
+            template = opened_template(subject, self._context.keyring)
+        return Attempt(rotation_epoch=state.TenantRow.rotation_epoch, template=template)
 
     def _record(
         self,
-        parameters: Mapping[str, Any],
-        by: By,
+        session: Session,
+        probe: Mapping[str, Any],
         attempt: Attempt,
         decided: Decided,
-        connection: Connection,
+        by: By,
     ) -> LockedOut | Replayed | None:
         """Record a decision inside a write; returns why it must be withheld, or None.
 
-        Raises
-        ------
-        Superseded
-            If the subject's template is not the one of `attempt`.
+        :class:`Superseded` if the subject's template is not the one of `attempt`.
         """
-        template_id = None if attempt.template is None else attempt.template.template_id
-        if decided.accepted and template_id is None:
-            raise ValueError("a subject that is not enrolled cannot be accepted")
-        pseudonym = parameters["pseudonym"]
-        row, now = _row_of(connection, RECORD_QUERY, parameters), self._context.clock()
-        status, spent = self._status(row), parameters["token"]
-        refusal: LockedOut | Replayed | None = None
-        outcome = "accept" if decided.accepted else "reject"
-        try:
-            if row.is_used:
-                raise Replayed(recorded=True)
-            self._policy.refuse_locked(status, now)
-        except LockedOut as error:
-            outcome, refusal = "locked_out", LockedOut(error.retry_after_s, recorded=True)
-        except Replayed as error:
-            outcome, refusal, spent = "replayed", error, None
+        state = _state_of(session, _STATE, probe)
+        refusal = self._refusal(state)
+        if refusal is None:
+            self._count(session, state, probe["pseudonym"], attempt, accepted=decided.accepted)
+            outcome = "accept" if decided.accepted else "reject"
         else:
-            stored = row.template_id if row.contract_id == parameters["contract_id"] else None
-            if stored != template_id:
-                raise Superseded
-            if not decided.accepted:
-                failed = (0, 0) if status is None else (status.consecutive, status.total)
-                new = self._policy.status(failed[0] + 1, failed[1] + 1, now)
-                _write_counts(connection, row, pseudonym, new)
-            else:
-                use = {"of_subject": row.subject_pk, "last_used_at": now}
-                connection.execute(_NOTE_USE, use)
-                if status is not None and not status.is_clear:
-                    _write_counts(connection, row, pseudonym, status.cleared())
-        entry = Entry("verify", outcome, by, parameters["tenant"], pseudonym, decided.level, spent)
-        self._context.audit_log.append(connection, entry)
+            refusal.recorded = True
+            outcome = "replayed" if state.is_used else "locked_out"
+        token = None if state.is_used else probe["token"]
+        tenant, pseudonym = probe["tenant"], probe["pseudonym"]
+        entry = Entry("verify", outcome, by, tenant, pseudonym, decided.level, token)
+        self._context.audit_log.append(session, entry)
         return refusal
 
-    def _status(self, row: Any) -> AttemptsStatus | None:
-        if row.counted is None:
+    def _refusal(self, state: Any) -> LockedOut | Replayed | None:
+        if state.is_used:
+            return Replayed()
+        return self._policy.refusal(self._status(state.FailedAttemptsRow), self._context.clock())
+
+    def _count(
+        self, session: Session, state: Any, pseudonym: str, attempt: Attempt, *, accepted: bool
+    ) -> None:
+        """Note the use or the failure in the rows of the subject."""
+        subject, counts, now = state.SubjectRow, state.FailedAttemptsRow, self._context.clock()
+        stored = None if subject is None else subject.template_id
+        if stored != (None if attempt.template is None else attempt.template.template_id):
+            raise Superseded
+        if accepted:
+            if subject is None:
+                raise ValueError("a subject that is not enrolled cannot be accepted")
+            subject.last_used_at = now
+            if counts is not None:
+                counts.consecutive = 0
+            return
+        if counts is None:
+            tenant_id = state.TenantRow.id
+            counts = FailedAttemptsRow(
+                tenant_id=tenant_id, pseudonym=pseudonym, consecutive=0, total=0
+            )
+            session.add(counts)
+        counts.consecutive += 1
+        counts.total += 1
+        counts.last_failed_at = now
+
+    def _status(self, counts: FailedAttemptsRow | None) -> AttemptsStatus | None:
+        if counts is None:
             return None
-        return self._policy.status(row.consecutive, row.total, row.last_failed_at)
+        return self._policy.status(counts.consecutive, counts.total, counts.last_failed_at)
 
     def _parameters(
         self,
@@ -279,94 +263,56 @@ class Attempts:
 
 
 # Made once: building a statement costs more than running it.
-_COUNTS = ("consecutive", "total", "last_failed_at")
-_COMMON = (
-    *(getattr(FailedAttemptsRow, name) for name in _COUNTS),
-    FailedAttemptsRow.pseudonym.label("counted"),
-    sa.exists(sa.select(AuditRow.sequence).where(AuditRow.token == sa.bindparam("token"))).label(
-        "is_used"
-    ),
+_STATE: Any = (
+    sa.select(
+        TenantRow,
+        FailedAttemptsRow,
+        SubjectRow,
+        sa.exists().where(AuditRow.token == sa.bindparam("token")).label("is_used"),
+    )
+    .outerjoin(
+        FailedAttemptsRow,
+        sa.and_(
+            FailedAttemptsRow.tenant_id == TenantRow.id,
+            FailedAttemptsRow.pseudonym == sa.bindparam("pseudonym"),
+        ),
+    )
+    .outerjoin(
+        SubjectRow,
+        sa.and_(
+            SubjectRow.tenant_id == TenantRow.id,
+            SubjectRow.subject_id == sa.bindparam("subject_id"),
+            SubjectRow.contract_id == sa.bindparam("contract_id"),
+        ),
+    )
+    .where(TenantRow.name == sa.bindparam("tenant"))
 )
-_IS_COUNTED = sa.and_(
-    FailedAttemptsRow.tenant_id == TenantRow.id,
-    FailedAttemptsRow.pseudonym == sa.bindparam("pseudonym"),
-)
-_IS_SUBJECT = sa.and_(
-    SubjectRow.tenant_id == TenantRow.id,
-    SubjectRow.subject_id == sa.bindparam("subject_id"),
-)
-_IS_TEMPLATE = TemplateRow.subject_pk == SubjectRow.id
-_OTHER = aliased(TemplateRow)
+"""What a decision is recorded against, in one row where there is the tenant; there is no subject
+where it has no template of the contract."""
+
+_OTHER = aliased(SubjectRow)
 
 
 def _first_ciphertext(*conditions: Any) -> Any:
-    query = sa.select(_OTHER.ciphertext).where(*conditions).order_by(_OTHER.subject_pk).limit(1)
+    query = sa.select(_OTHER.ciphertext).where(*conditions).order_by(_OTHER.id).limit(1)
     return query.scalar_subquery()
 
 
 _STAND_IN = sa.func.coalesce(
-    _first_ciphertext(_OTHER.subject_pk >= sa.bindparam("place")), _first_ciphertext()
+    _first_ciphertext(_OTHER.id >= sa.bindparam("place")), _first_ciphertext()
 )
 """The ciphertext of another subject, always the same one, which nobody opens: a template's bytes
 take a time that would tell who is enrolled."""
 
-DECISION_QUERY: Any = (
-    sa.select(
-        *TEMPLATE_COLUMNS,
-        sa.case((TemplateRow.ciphertext.is_(None), _STAND_IN)).label("stand_in"),
-        TenantRow.rotation_epoch.label("current_epoch"),
-        *_COMMON,
-    )
-    .select_from(TenantRow)
-    .outerjoin(FailedAttemptsRow, _IS_COUNTED)
-    .outerjoin(SubjectRow, _IS_SUBJECT)
-    .outerjoin(
-        TemplateRow, sa.and_(_IS_TEMPLATE, TemplateRow.contract_id == sa.bindparam("contract_id"))
-    )
-    .where(TenantRow.name == sa.bindparam("tenant"))
+DECISION_QUERY: Any = _STATE.options(SEALED).add_columns(
+    sa.case((SubjectRow.id.is_(None), _STAND_IN)).label("stand_in")
 )
-"""What a decision reads, in one row where there is the tenant; the columns of the template are NULL
-where the subject has none of the contract."""
-
-RECORD_QUERY: Any = (
-    sa.select(
-        TenantRow.id.label("tenant_id"),
-        SubjectRow.id.label("subject_pk"),
-        TemplateRow.template_id,
-        TemplateRow.contract_id,
-        *_COMMON,
-    )
-    .select_from(TenantRow)
-    .outerjoin(FailedAttemptsRow, _IS_COUNTED)
-    .outerjoin(SubjectRow, _IS_SUBJECT)
-    .outerjoin(TemplateRow, _IS_TEMPLATE)
-    .where(TenantRow.name == sa.bindparam("tenant"))
-)
-"""What a decision is recorded against, in one row where there is the tenant."""
-
-_failures = cast(sa.Table, FailedAttemptsRow.__table__)
-_subjects = cast(sa.Table, SubjectRow.__table__)
-_FIRST_COUNTS = sa.insert(_failures)
-_NEXT_COUNTS = sa.update(_failures).where(
-    _failures.c.tenant_id == sa.bindparam("of_tenant"),
-    _failures.c.pseudonym == sa.bindparam("of_pseudonym"),
-)
-_NOTE_USE = sa.update(_subjects).where(_subjects.c.id == sa.bindparam("of_subject"))
+"""What a decision reads."""
 
 
-def _row_of(connection: Connection, query: Any, parameters: Mapping[str, Any]) -> Any:
+def _state_of(session: Session, query: Any, probe: Mapping[str, Any]) -> Any:
     """The one row of a query; :class:`UnknownTenant` where there is none."""
-    row = connection.execute(query, parameters).one_or_none()
-    if row is None:
-        raise UnknownTenant.of_name(parameters["tenant"])
-    return row
-
-
-def _write_counts(connection: Connection, row: Any, pseudonym: str, status: AttemptsStatus) -> None:
-    counts = {name: getattr(status, name) for name in _COUNTS}
-    if row.counted is None:
-        identity = {"tenant_id": row.tenant_id, "pseudonym": pseudonym}
-        connection.execute(_FIRST_COUNTS, {**identity, **counts})
-    else:
-        identity = {"of_tenant": row.tenant_id, "of_pseudonym": pseudonym}
-        connection.execute(_NEXT_COUNTS, {**identity, **counts})
+    state = session.execute(query, probe).one_or_none()
+    if state is None:
+        raise UnknownTenant.of_name(probe["tenant"])
+    return state

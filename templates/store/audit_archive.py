@@ -18,21 +18,20 @@ from pathlib import Path
 from typing import Any
 
 import sqlalchemy as sa
-from sqlalchemy.engine import Connection
+from sqlalchemy.orm import Session
 
 from templates.errors import StoreError
 from templates.keys.private_file import create_private
 from templates.store.audit_chain import (
-    LINES,
     Anchor,
     BrokenAuditLog,
+    ChainBreak,
     Head,
-    line_break,
-    move_head,
-    read_head,
+    good_lines,
 )
 from templates.store.audit_log import By, Entry
 from templates.store.context import StoreContext
+from templates.store.database import delete
 from templates.store.receipts import Receipt, sign_claims, verify_claims
 from templates.store.schema import AuditRow
 from templates.store.secrets import SecretName
@@ -69,48 +68,42 @@ def archive_lines(context: StoreContext, file: Path, *, through: int | None, by:
     StoreError
         If there are none, or the file exists or cannot be written.
     """
-
-    def work(connection: Connection) -> Archive:
-        end = _last_to_go(connection, context, through)
-        archive = write_archive(connection, context, file, end)
+    with context.database.write() as session:
+        archive = write_archive(session, context, file, _last_to_go(session, context, through))
         detail = f"{archive.base.sequence + 1}-{archive.last.sequence}"
-        context.audit_log.append(connection, Entry("audit-archive", "archived", by, detail=detail))
-        return archive
-
-    archive = context.database.write(work)
+        context.audit_log.append(session, Entry("audit-archive", "archived", by, detail=detail))
     context.database.purge_log()
     return archive
 
 
-def _last_to_go(connection: Connection, context: StoreContext, through: int | None) -> int | None:
+def _last_to_go(session: Session, context: StoreContext, through: int | None) -> int | None:
     used_since = (context.clock() - TOKENS_LAST).astimezone(UTC).isoformat(timespec="microseconds")
     query = sa.select(sa.func.min(AuditRow.sequence)).where(
         AuditRow.token.is_not(None), AuditRow.at > used_since
     )
-    first_use = connection.execute(query).scalar()
+    first_use = session.scalar(query)
     if first_use is None:
         return through
     return first_use - 1 if through is None else min(through, first_use - 1)
 
 
 def write_archive(
-    connection: Connection, context: StoreContext, file: Path, through: int | None
+    session: Session, context: StoreContext, file: Path, through: int | None
 ) -> Archive:
     """:func:`archive_lines` inside a write, without the line that tells of it."""
     key = context.audit_log.key
-    head = read_head(connection, key)
+    head = Head.read(session, key)
     end = head.last.sequence if through is None else min(through, head.last.sequence)
-    query = LINES.where(AuditRow.sequence <= end).order_by(AuditRow.sequence)
     last, texts = head.base, []
-    for row in connection.execute(query):
-        values: dict[str, Any] = row._asdict()
-        if what := line_break(key, values, last):
-            raise BrokenAuditLog(
-                f"line {values['sequence']} of the audit log is {what}, and nothing was archived: "
-                "run `veilface audit-log verify`"
-            )
-        texts.append(json.dumps({**values, "mac": values["mac"].hex()}))
-        last = Anchor(values["sequence"], values["mac"])
+    try:
+        for values in good_lines(session, key, head, through=end):
+            texts.append(json.dumps({**values, "mac": values["mac"].hex()}))
+            last = Anchor(values["sequence"], values["mac"])
+    except ChainBreak as problem:
+        raise BrokenAuditLog(
+            f"line {problem.sequence} of the audit log is {problem.what}, and nothing was "
+            "archived: run `veilface audit-log verify`"
+        ) from None
     if not texts:
         raise StoreError(
             "the audit log holds no line up to this number that may go; nothing was archived"
@@ -128,8 +121,8 @@ def write_archive(
         create_private(file, json.dumps(first).encode() + b"\n" + body)
     except OSError as error:
         raise StoreError(f"the archive {file} cannot be written: {error.strerror}") from None
-    connection.execute(sa.delete(AuditRow).where(AuditRow.sequence <= last.sequence))
-    move_head(connection, key, Head(last, head.last))
+    delete(session, AuditRow, AuditRow.sequence <= last.sequence)
+    Head(last, head.last).replace(session, key)
     return Archive(head.base, last, len(texts))
 
 

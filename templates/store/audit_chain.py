@@ -10,17 +10,19 @@ kept elsewhere shows it.
 import hashlib
 import hmac
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import sqlalchemy as sa
-from sqlalchemy.engine import Connection
+from sqlalchemy.orm import Session
 
 from templates.errors import StoreError
 from templates.keys.sealing import encode_parts
 from templates.store.identifiers import InvalidIdentifier
 from templates.store.schema import AuditHeadRow, AuditRow
+
+BATCH = 1000
 
 _ANCHOR = re.compile(r"([0-9]{1,18}):([0-9a-f]{64})")
 _COLUMNS = tuple(column.key for column in AuditRow.__table__.columns)
@@ -40,6 +42,14 @@ _HEADS: Any = sa.select(
         for name in (*_HEAD, "mac")
     )
 )
+
+
+@dataclass(eq=False)
+class ChainBreak(Exception):
+    """The first break of the chain: the number of the line, and what is wrong there."""
+
+    sequence: int
+    what: str
 
 
 class BrokenAuditLog(StoreError):
@@ -85,76 +95,51 @@ class Head:
     base: Anchor
     last: Anchor
 
-    @property
-    def ends(self) -> tuple[int, bytes, int, bytes]:
-        """Columns of the head row, without its MAC."""
-        return self.base.sequence, self.base.mac, self.last.sequence, self.last.mac
+    @classmethod
+    def read(cls, session: Session, key: bytes) -> "Head":
+        """Read both ends of the chain; :class:`BrokenAuditLog` if the row is missing or forged."""
+        rows = session.execute(_HEADS).all()
+        if len(rows) == 1:
+            row = rows[0]
+            with_types = [type(value) for value in row]
+            if with_types == [int, bytes, int, bytes, bytes]:
+                head = cls(
+                    Anchor(row.base_sequence, row.base_mac), Anchor(row.sequence, row.line_mac)
+                )
+                if hmac.compare_digest(head.columns(key)["mac"], row.mac):
+                    return head
+        raise BrokenAuditLog(
+            "the head of the audit log is missing or was altered: "
+            "run `veilface audit-log verify`, and restore the database from a backup"
+        )
 
-    def mac(self, key: bytes) -> bytes:
-        """MAC of the head row."""
-        return hmac.digest(key, encode_parts("head", *self.ends), hashlib.sha256)
+    def columns(self, key: bytes) -> dict[str, Any]:
+        """Columns of the head row, with its MAC."""
+        ends = self.base.sequence, self.base.mac, self.last.sequence, self.last.mac
+        mac = hmac.digest(key, encode_parts("head", *ends), hashlib.sha256)
+        return {**dict(zip(_HEAD, ends, strict=True)), "mac": mac}
+
+    def replace(self, session: Session, key: bytes) -> None:
+        """Put both ends into the head row, in a write."""
+        session.execute(_MOVE_HEAD, self.columns(key))
 
 
-def begin_chain(connection: Connection, key: bytes, base: Anchor = START) -> None:
+def begin_chain(session: Session, key: bytes, base: Anchor = START) -> None:
     """Begin a chain under a new key, in a write; a head that is there already is replaced."""
-    connection.execute(sa.delete(AuditHeadRow))
-    columns = head_columns(Head(base, base), key)
-    connection.execute(sa.insert(AuditHeadRow).values(id=1, **columns))
+    session.execute(sa.delete(AuditHeadRow))
+    session.add(AuditHeadRow(id=1, **Head(base, base).columns(key)))
 
 
-def append_line(connection: Connection, key: bytes, columns: Mapping[str, Any]) -> None:
+def append_line(session: Session, key: bytes, columns: Mapping[str, Any]) -> None:
     """Add a line inside a write, from all its columns except the number and the MAC.
 
-    Raises
-    ------
-    BrokenAuditLog
-        If the head row is missing or forged. Adding to it would hide that.
+    :class:`BrokenAuditLog` if the head row is missing or forged. Adding to it would hide that.
     """
-    head = read_head(connection, key)
+    head = Head.read(session, key)
     values = {**columns, "sequence": head.last.sequence + 1}
     values["mac"] = line_mac(key, values, head.last.mac)
-    connection.execute(_ADD_LINE, values)
-    move_head(connection, key, Head(head.base, Anchor(values["sequence"], values["mac"])))
-
-
-def move_head(connection: Connection, key: bytes, head: Head) -> None:
-    """Replace both ends of the chain, in a write."""
-    connection.execute(_MOVE_HEAD, head_columns(head, key))
-
-
-def read_head(connection: Connection, key: bytes) -> Head:
-    """Read both ends of the chain.
-
-    Raises
-    ------
-    BrokenAuditLog
-        If the row is missing or forged.
-    """
-    rows = connection.execute(_HEADS).all()
-    if len(rows) == 1:
-        row = rows[0]
-        with_types = [type(value) for value in row]
-        if with_types == [int, bytes, int, bytes, bytes]:
-            head = Head(Anchor(row.base_sequence, row.base_mac), Anchor(row.sequence, row.line_mac))
-            if hmac.compare_digest(head.mac(key), row.mac):
-                return head
-    raise BrokenAuditLog(
-        "the head of the audit log is missing or was altered: "
-        "run `veilface audit-log verify`, and restore the database from a backup"
-    )
-
-
-def head_columns(head: Head, key: bytes) -> dict[str, Any]:
-    """Columns of the head row."""
-    return {**dict(zip(_HEAD, head.ends, strict=True)), "mac": head.mac(key)}
-
-
-def rows_after(connection: Connection, after: int | None, most: int | None = None) -> Sequence[Any]:
-    """Lines in their order, after the number of one, or from the very first row."""
-    query = LINES.order_by(AuditRow.sequence).limit(most)
-    if after is not None:
-        query = query.where(AuditRow.sequence > after)
-    return connection.execute(query).all()
+    session.execute(_ADD_LINE, values)
+    Head(head.base, Anchor(values["sequence"], values["mac"])).replace(session, key)
 
 
 def line_mac(key: bytes, values: Mapping[str, Any], previous: bytes) -> bytes:
@@ -172,7 +157,44 @@ def line_mac(key: bytes, values: Mapping[str, Any], previous: bytes) -> bytes:
     return hmac.digest(key, encode_parts("line", previous, *parts), hashlib.sha256)
 
 
-def line_break(key: bytes, values: Mapping[str, Any], last: Anchor) -> str | None:
+def good_lines(
+    session: Session,
+    key: bytes,
+    head: Head,
+    *,
+    through: int | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> Iterator[Mapping[str, Any]]:
+    """Yield the columns of each line that follows on the one before, in a snapshot or a write.
+
+    Through a number, or else to the end, which must be that of the head. `progress` is called after
+    each batch with the number of its lines.
+
+    Raises
+    ------
+    ChainBreak
+    """
+    last = head.base
+    # From the very first row: one that was slipped in before the base is seen too.
+    query = LINES.order_by(AuditRow.sequence).execution_options(yield_per=BATCH)
+    if through is not None:
+        query = query.where(AuditRow.sequence <= through)
+    for rows in session.execute(query).partitions():
+        for row in rows:
+            columns = row._asdict()
+            if what := _fault(key, columns, last):
+                raise ChainBreak(min(row.sequence, last.sequence + 1), what)
+            yield columns
+            last = Anchor(row.sequence, row.mac)
+        if progress is not None:
+            progress(len(rows))
+    if through is None and head.last != last:
+        missing = head.last.sequence > last.sequence
+        what = "missing" if missing else "head does not match"
+        raise ChainBreak(last.sequence + missing, what)
+
+
+def _fault(key: bytes, values: Mapping[str, Any], last: Anchor) -> str | None:
     """Say why a line does not follow; None where it does."""
     if values["sequence"] != last.sequence + 1:
         return "missing" if values["sequence"] > last.sequence else "out of order"

@@ -10,20 +10,20 @@ import hashlib
 import sqlite3
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import sqlalchemy as sa
-from sqlalchemy.engine import Connection, Engine
+from sqlalchemy.engine import Connection
 from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
+from sqlalchemy.orm import Session
 
 from templates.errors import StoreBusy, StoreError, StoreUnavailable
 from templates.store.engine import checked_url, make_engine, sqlite_file
+from templates.store.schema import Base
 from templates.store.turn import next_in_line
-
-T = TypeVar("T")
 
 try:
     import psycopg
@@ -89,34 +89,34 @@ class Database:
         else:
             self._readers = self.engine.execution_options(isolation_level="AUTOCOMMIT")
 
-    def read(self, work: Callable[[Connection], T]) -> T:
-        """Run `work` on a connection; what it sees is committed.
+    @contextlib.contextmanager
+    def read(self) -> Iterator[Session]:
+        """Give a session; what it sees is committed.
 
-        An error is a :class:`StoreError` in our own words, without a statement, its parameters or
-        a row.
+        An error in the block is a :class:`StoreError` in our own words, without a statement, its
+        parameters or a row.
         """
-        return self._read(self._readers, work)
-
-    def snapshot(self, work: Callable[[Connection], T]) -> T:
-        """:meth:`read`, where all queries of `work` see the same moment; no write waits for it."""
-        if self.is_sqlite:  # whose readers see one moment anyway
-            return self.read(work)
-        level = {"isolation_level": "REPEATABLE READ"}
-        return self._read(self.engine.execution_options(**level), work)
-
-    def _read(self, engine: Engine, work: Callable[[Connection], T]) -> T:
-        with _translating(), engine.connect() as connection:
+        with _translating(), Session(self._readers) as session:
             if self.is_sqlite:
-                _driver(connection).execute("BEGIN")
+                _driver(session.connection()).execute("BEGIN")
                 self._require_file()
-            return work(connection)
+            yield session
 
-    def write(self, work: Callable[[Connection], T], *, wait: float | None = None) -> T:
-        """Run `work`, a short one, in one transaction, while no other write runs, and commit it.
+    @contextlib.contextmanager
+    def snapshot(self) -> Iterator[Session]:
+        """:meth:`read`, where all queries see the same moment; no write waits for it."""
+        with self.read() as session:
+            if not self.is_sqlite:  # whose readers see one moment anyway
+                session.connection(execution_options={"isolation_level": "REPEATABLE READ"})
+            yield session
 
-        `wait` is how many seconds to wait for other writes, the timeout by default, and 0 for as
-        long as it takes (on SQLite, and for the threads of this process, the timeout). After
-        :class:`StoreBusy`, as after any error, nothing was written.
+    @contextlib.contextmanager
+    def write(self, *, wait: float | None = None) -> Iterator[Session]:
+        """Give a session in one transaction, while no other write runs, and commit it.
+
+        Keep the block short. `wait` is how many seconds to wait for other writes, the timeout by
+        default, and 0 for as long as it takes (on SQLite, and for the threads of this process, the
+        timeout). After :class:`StoreBusy`, as after any error, nothing was written.
         """
         wait = self._timeout if wait is None else wait
         patience = wait or self._timeout
@@ -124,14 +124,17 @@ class Database:
         # Threads queue here in turn: SQLite's own lock is polled and knows no order, and on
         # PostgreSQL each that waits would hold a connection that readers need.
         turn = self._turn_of_threads(patience)
-        with _translating(), turn, self.engine.begin() as connection:
+        # Rows stay readable after the commit.
+        session = Session(self.engine, expire_on_commit=False)
+        with _translating(), turn, session, session.begin():
             if self.is_sqlite:
+                connection = session.connection()
                 with self._turn(until), self._patience(connection, until) as driver:
                     driver.execute("BEGIN IMMEDIATE")
                 self._require_file()
             else:
-                connection.execute(_BEGIN_WRITE, {"limit": str(round(1000 * wait))})
-            return work(connection)
+                session.execute(_BEGIN_WRITE, {"limit": str(round(1000 * wait))})
+            yield session
 
     def purge_log(self) -> bool:
         """Move SQLite's write-ahead log into the database file and empty it.
@@ -153,8 +156,13 @@ class Database:
             return not busy
         return False
 
-    def compact(self, tables: Sequence[str]) -> None:
-        """Rewrite tables (PostgreSQL) or the file (SQLite) without what was removed from them."""
+    def compact(self) -> None:
+        """Rewrite all tables (PostgreSQL) or the file (SQLite), so that no page keeps removed rows.
+
+        PostgreSQL keeps a removed row in its page until it vacuums; ``VACUUM FULL`` writes new
+        files and locks each table meanwhile. SQLite overwrites as it deletes; there this gives
+        the free pages back to the file system.
+        """
         autocommit = self.engine.execution_options(isolation_level="AUTOCOMMIT")
         with (
             _translating(),
@@ -164,19 +172,9 @@ class Database:
         ):
             if self.is_sqlite:
                 _driver(connection).execute("VACUUM")
-            for table in () if self.is_sqlite else tables:
-                name = connection.dialect.identifier_preparer.quote(table)
-                connection.exec_driver_sql(f"VACUUM (FULL) {name}")
+            for table in () if self.is_sqlite else Base.metadata.tables:
+                connection.exec_driver_sql(f"VACUUM (FULL) {table}")
         self.purge_log()
-
-    def size(self) -> int:
-        """Bytes of the database: of its file (SQLite), or as the server counts (PostgreSQL)."""
-        query = (
-            "SELECT page_count * page_size FROM pragma_page_count(), pragma_page_size()"
-            if self.is_sqlite
-            else "SELECT pg_database_size(current_database())"
-        )
-        return int(self.read(lambda connection: connection.exec_driver_sql(query).scalar_one()))
 
     def close(self) -> None:
         """Close the connections of this process that are idle."""
@@ -216,6 +214,12 @@ class Database:
 
     def __repr__(self) -> str:
         return f"Database({self.url.render_as_string(hide_password=True)!r})"
+
+
+def delete(session: Session, table: type[Base], *conditions: Any) -> int:
+    """Delete rows; returns how many."""
+    result: Any = session.execute(sa.delete(table.__table__).where(*conditions))  # type: ignore[arg-type]
+    return int(result.rowcount)
 
 
 def _identity(file: Path | None) -> tuple[int, int] | None:

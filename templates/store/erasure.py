@@ -1,14 +1,13 @@
 """Erasing a subject or a tenant: everything about it goes, a signed receipt comes."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import sqlalchemy as sa
-from sqlalchemy.engine import Connection
+from sqlalchemy.orm import Session
 
 from templates.store.audit_log import PROGRAM, TENANT_ERASE, By, Entry
 from templates.store.context import StoreContext
+from templates.store.database import delete
 from templates.store.identifiers import UnknownTenant, checked_subject_id, checked_tenant_name
 from templates.store.receipts import (
     SUBJECT_KIND,
@@ -18,15 +17,8 @@ from templates.store.receipts import (
     latest_receipt,
     tenant_receipt_name,
 )
-from templates.store.schema import (
-    ApiKeyRow,
-    FailedAttemptsRow,
-    RotationKeyRow,
-    SubjectRow,
-    TemplateRow,
-    TenantRow,
-)
-from templates.store.subject_rows import subject_pk_of
+from templates.store.schema import Base, FailedAttemptsRow, SubjectRow, TenantRow
+from templates.store.subjects import subject_of
 from templates.store.tenants import tenant_of
 
 
@@ -62,33 +54,26 @@ class Erasures:
         enroll a subject may also start its count anew.
         """
         subject_id = checked_subject_id(subject_id)
-        return self._run(lambda connection: self._erase(connection, tenant, subject_id, by))
+        with self._context.database.write() as session:
+            receipt, erased = self._erase(session, tenant, subject_id, by)
+        return Erasure(receipt, erased, log_purged=self._context.database.purge_log())
 
     def erase_if(
         self, tenant: str, subject_id: str, condition: sa.ColumnElement[bool], *, by: By
-    ) -> Receipt | None:
-        """:meth:`erase` a subject whose row meets a condition when it is erased; None otherwise.
+    ) -> bool:
+        """:meth:`erase` a subject whose row meets a condition when it is erased; False otherwise.
 
         Emptying SQLite's write-ahead log is left to the caller, who may erase many.
         """
-        subject_id = checked_subject_id(subject_id)
-        query = (
-            sa.select(SubjectRow.id)
-            .join(TenantRow, TenantRow.id == SubjectRow.tenant_id)
-            .where(TenantRow.name == tenant, SubjectRow.subject_id == subject_id, condition)
-        )
-
-        def work(connection: Connection) -> Receipt | None:
-            if connection.execute(query).one_or_none() is None:
-                return None
-            return self._erase(connection, tenant, subject_id, by)[0]
-
-        return self._context.database.write(work)
+        with self._context.database.write() as session:
+            is_met = session.scalar(sa.select(SubjectRow.id).where(condition)) is not None
+            return is_met and self._erase(session, tenant, subject_id, by)[1]
 
     def receipt(self, tenant: str, subject_id: str) -> Receipt | None:
         """Return the latest erasure receipt of a subject, or None."""
         pseudonym = self._context.signer.pseudonym(tenant, checked_subject_id(subject_id))
-        return self._context.database.read(lambda connection: latest_receipt(connection, pseudonym))
+        with self._context.database.read() as session:
+            return latest_receipt(session, pseudonym)
 
     def erase_tenant(self, tenant: str, *, by: By = PROGRAM) -> Erasure:
         """Remove all that is held of a tenant, its keys included; leave one signed receipt.
@@ -102,64 +87,58 @@ class Erasures:
             If there never was a tenant of this name.
         """
         checked_tenant_name(tenant)
-        return self._run(lambda connection: self._erase_tenant(connection, tenant, by))
-
-    def _run(self, work: Callable[[Connection], tuple[Receipt, bool]]) -> Erasure:
-        receipt, erased = self._context.database.write(work)
+        with self._context.database.write() as session:
+            receipt, erased = self._erase_tenant(session, tenant, by)
         return Erasure(receipt, erased, log_purged=self._context.database.purge_log())
 
     def _erase(
-        self, connection: Connection, tenant: str, subject_id: str, by: By
+        self, session: Session, tenant: str, subject_id: str, by: By
     ) -> tuple[Receipt, bool]:
         pseudonym = self._context.signer.pseudonym(tenant, subject_id)
-        tenant_id = tenant_of(connection, tenant).id
-        subject_pk = subject_pk_of(connection, tenant_id, subject_id)
-        failed_attempts = _delete(
-            connection,
+        tenant_id = tenant_of(session, tenant).id
+        subject = subject_of(session, tenant, subject_id)
+        failed_attempts = delete(
+            session,
             FailedAttemptsRow,
             FailedAttemptsRow.tenant_id == tenant_id,
             FailedAttemptsRow.pseudonym == pseudonym,
         )
-        receipt = None if subject_pk else latest_receipt(connection, pseudonym)
+        receipt = None if subject else latest_receipt(session, pseudonym)
         outcome = "receipt_repeated"
         if receipt is None:
-            contract_id = connection.execute(
-                sa.select(TemplateRow.contract_id).where(TemplateRow.subject_pk == subject_pk)
-            ).scalar_one_or_none()
-            # Its template goes with the subject, by the foreign key.
-            subjects = _delete(connection, SubjectRow, SubjectRow.id == subject_pk)
-            outcome, now = "erased" if subjects else "nothing_held", self._context.clock()
+            outcome, now = "erased" if subject else "nothing_held", self._context.clock()
+            subjects = delete(session, SubjectRow, SubjectRow.id == subject.id) if subject else 0
             receipt = self._context.signer.sign(
                 SUBJECT_KIND,
                 tenant=tenant,
                 subject=pseudonym,
-                held=contract_id is not None,
-                contract_id=contract_id,
-                # The data key is a column of the subject's row, with the metadata.
+                held=subject is not None,
+                contract_id=subject and subject.contract_id,
+                # Template, data key and metadata are columns of the subject's row.
                 erased={
                     **dict.fromkeys(("template", "data_key", "metadata"), subjects),
                     "failed_attempts": failed_attempts,
                 },
                 erased_at=now,
             )
-            keep_receipt(connection, pseudonym, receipt, now)
-        self._context.audit_log.append(connection, Entry("erase", outcome, by, tenant, pseudonym))
+            keep_receipt(session, pseudonym, receipt, now)
+        self._context.audit_log.append(session, Entry("erase", outcome, by, tenant, pseudonym))
         return receipt, outcome == "erased"
 
-    def _erase_tenant(self, connection: Connection, tenant: str, by: By) -> tuple[Receipt, bool]:
+    def _erase_tenant(self, session: Session, tenant: str, by: By) -> tuple[Receipt, bool]:
         name, now = tenant_receipt_name(tenant), self._context.clock()
         try:
-            owner = tenant_of(connection, tenant)
+            owner = tenant_of(session, tenant)
         except UnknownTenant:
-            earlier = latest_receipt(connection, name)
+            earlier = latest_receipt(session, name)
             if earlier is None:
                 raise
             entry = Entry(TENANT_ERASE, "receipt_repeated", by, tenant)
-            self._context.audit_log.append(connection, entry)
+            self._context.audit_log.append(session, entry)
             return earlier, False
-        erased = _counts(connection, owner.id)
+        erased = _counts(session, owner.id)
         # Everything else of the tenant goes with its row, by the foreign keys.
-        _delete(connection, TenantRow, TenantRow.id == owner.id)
+        delete(session, TenantRow, TenantRow.id == owner.id)
         receipt = self._context.signer.sign(
             TENANT_KIND,
             tenant=tenant,
@@ -168,27 +147,20 @@ class Erasures:
             erased=erased,
             erased_at=now,
         )
-        keep_receipt(connection, name, receipt, now)
-        self._context.audit_log.append(
-            connection, Entry(TENANT_ERASE, "erased", by, tenant, detail=owner.id)
-        )
+        keep_receipt(session, name, receipt, now)
+        entry = Entry(TENANT_ERASE, "erased", by, tenant, detail=owner.id)
+        self._context.audit_log.append(session, entry)
         return receipt, True
 
 
-def _delete(connection: Connection, table: type[Any], *conditions: Any) -> int:
-    return connection.execute(sa.delete(table).where(*conditions)).rowcount
+def _counts(session: Session, tenant_id: str) -> dict[str, int]:
+    """Count the records of a tenant in each table that holds some."""
 
+    def count(table: sa.Table) -> int:
+        query = sa.select(sa.func.count()).where(table.c.tenant_id == tenant_id)
+        return session.execute(query).scalar_one()
 
-def _counts(connection: Connection, tenant_id: str) -> dict[str, int]:
-    """Count the records of a tenant, each kind in the table that holds it."""
-
-    def count(table: type[Any]) -> int:
-        query = sa.select(sa.func.count()).select_from(table).where(table.tenant_id == tenant_id)
-        return int(connection.execute(query).scalar_one())
-
-    return {
-        **dict.fromkeys(("subjects", "templates", "data_keys"), count(SubjectRow)),
-        "rotation_keys": count(RotationKeyRow),
-        "api_keys": count(ApiKeyRow),
-        "failed_attempts": count(FailedAttemptsRow),
-    }
+    tables = [table for table in Base.metadata.sorted_tables if "tenant_id" in table.c]
+    counts = {table.name: count(table) for table in tables}
+    # A subject's row has its template and its data key.
+    return counts | dict.fromkeys(("templates", "data_keys"), counts["subjects"])

@@ -18,15 +18,6 @@ class AttemptsStatus:
     locked_until: datetime | None
     disabled_at: datetime | None
 
-    @property
-    def is_clear(self) -> bool:
-        """Whether there is nothing that a reset would lift."""
-        return self.consecutive == 0 and self.locked_until is None and self.disabled_at is None
-
-    def cleared(self) -> "AttemptsStatus":
-        """After an accept or a reset: the total stays."""
-        return AttemptsStatus(0, self.total, self.last_failed_at, None, None)
-
 
 @dataclass(frozen=True)
 class LockoutPolicy:
@@ -60,21 +51,19 @@ class LockoutPolicy:
             disabled_at = last_failed_at if consecutive >= self.disable_at else None
         return AttemptsStatus(consecutive, total, last_failed_at, locked_until, disabled_at)
 
-    def refuse_locked(self, status: AttemptsStatus | None, now: datetime) -> None:
-        """Raise :class:`LockedOut` where the subject is locked now.
+    def refusal(self, status: AttemptsStatus | None, now: datetime) -> "LockedOut | None":
+        """Why nothing is decided on the subject now; None where it is not locked.
 
         A lock that seems to begin in the future, by more than its own length, is ignored: the
         clock was set back, and the lock would last until that time comes again.
         """
-        if not self.after or status is None:
-            return
+        if not self.after or status is None or status.locked_until is None:
+            return None
         if status.disabled_at is not None:
-            raise LockedOut(None)
-        until = status.locked_until
-        if until is None or now >= until:
-            return
-        if status.last_failed_at - now < until - status.last_failed_at:
-            raise LockedOut((until - now).total_seconds())
+            return LockedOut(None)
+        until, length = status.locked_until, status.locked_until - status.last_failed_at
+        is_locked = now < until < now + 2 * length
+        return LockedOut((until - now).total_seconds()) if is_locked else None
 
 
 class Superseded(StoreBusy):

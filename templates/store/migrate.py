@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import sqlalchemy as sa
-from sqlalchemy.engine import Connection
+from sqlalchemy.orm import Session
 
 from templates.errors import StoreError
 from templates.store.database import Database
@@ -20,19 +20,17 @@ def upgrade(database: Database) -> None:
     StoreError
         If the schema is one that this program does not know. Nothing was changed.
     """
-
-    def work(connection: Connection) -> None:
-        present = _revision_of(connection)
+    with database.write(wait=0) as session:
+        present = _revision_of(session)
         _require_known(present)
         if present != head_revision():
-            _migrate(connection)
-
-    database.write(work, wait=0)
+            _migrate(session)
 
 
 def current_revision(database: Database) -> str | None:
     """Revision the database is at; None for an empty one."""
-    return database.read(_revision_of)
+    with database.read() as session:
+        return _revision_of(session)
 
 
 def head_revision() -> str:
@@ -59,11 +57,10 @@ def check(database: Database) -> None:
         )
 
 
-def _revision_of(connection: Connection) -> str | None:
-    if not sa.inspect(connection).has_table(_VERSION.name):
+def _revision_of(session: Session) -> str | None:
+    if not sa.inspect(session.connection()).has_table(_VERSION.name):
         return None
-    revision: str | None = connection.scalar(sa.select(_VERSION.c.version_num))
-    return revision
+    return session.scalar(sa.select(_VERSION.c.version_num))
 
 
 def _require_known(revision: str | None) -> None:
@@ -74,7 +71,7 @@ def _require_known(revision: str | None) -> None:
         )
 
 
-def _migrate(connection: Connection) -> None:
+def _migrate(session: Session) -> None:
     # Imported here: a worker that finds the right schema does without, and its 11 MB.
     from alembic import command
     from alembic.config import Config
@@ -82,5 +79,5 @@ def _migrate(connection: Connection) -> None:
     config = Config()
     config.set_main_option("script_location", str(MIGRATIONS).replace("%", "%%"))
     config.set_main_option("path_separator", "newline")
-    config.attributes["connection"] = connection
+    config.attributes["connection"] = session.connection()
     command.upgrade(config, "head")

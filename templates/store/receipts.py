@@ -9,6 +9,7 @@ tenant.
 
 import base64
 import binascii
+import contextlib
 import hashlib
 import hmac
 import json
@@ -22,7 +23,7 @@ from typing import Any
 import sqlalchemy as sa
 from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
-from sqlalchemy.engine import Connection
+from sqlalchemy.orm import Session
 
 from templates.contract.canonical import canonical_json
 from templates.errors import StoreError
@@ -135,23 +136,17 @@ def tenant_receipt_name(tenant: str) -> str:
     return hashlib.sha256(encode_parts("tenant erasure", tenant)).hexdigest()
 
 
-def keep_receipt(connection: Connection, pseudonym: str, receipt: Receipt, now: datetime) -> None:
+def keep_receipt(session: Session, pseudonym: str, receipt: Receipt, now: datetime) -> None:
     """Store a receipt under a subject's pseudonym, or a :func:`tenant_receipt_name`."""
-    connection.execute(
-        sa.insert(ReceiptRow).values(
-            pseudonym=pseudonym, body=receipt.body, signature=receipt.signature, created_at=now
-        )
-    )
+    row = ReceiptRow(pseudonym=pseudonym, body=receipt.body, signature=receipt.signature)
+    row.created_at = now
+    session.add(row)
 
 
-def latest_receipt(connection: Connection, pseudonym: str) -> Receipt | None:
+def latest_receipt(session: Session, pseudonym: str) -> Receipt | None:
     """The last receipt that :func:`keep_receipt` stored under a name, or None."""
-    row = connection.execute(
-        sa.select(*_RECEIPT)
-        .where(ReceiptRow.pseudonym == pseudonym)
-        .order_by(ReceiptRow.sequence.desc())
-        .limit(1)
-    ).one_or_none()
+    of_name = sa.select(ReceiptRow).where(ReceiptRow.pseudonym == pseudonym)
+    row = session.scalars(of_name.order_by(ReceiptRow.sequence.desc()).limit(1)).one_or_none()
     return None if row is None else Receipt(row.body, row.signature)
 
 
@@ -188,22 +183,16 @@ def verify_claims(signed: Receipt, public_key: bytes) -> dict[str, Any]:
     return claims
 
 
-def sign_again(connection: Connection, old_key: bytes, new_key: bytes) -> int:
+def sign_again(session: Session, old_key: bytes, new_key: bytes) -> int:
     """Sign every receipt that the deployment keeps anew, in a write; returns how many.
 
     One whose signature under the old private key does not hold stays as it is.
     """
     public_key, count = public_key_of(old_key), 0
-    for row in connection.execute(sa.select(ReceiptRow.sequence, *_RECEIPT)).all():
-        try:
+    for row in session.scalars(sa.select(ReceiptRow)):
+        with contextlib.suppress(StoreError):
             claims = verify_receipt(Receipt(row.body, row.signature), public_key)
-        except StoreError:
-            continue
-        receipt = sign_claims(claims, new_key)
-        statement = sa.update(ReceiptRow).where(ReceiptRow.sequence == row.sequence)
-        connection.execute(statement.values(body=receipt.body, signature=receipt.signature))
-        count += 1
+            receipt = sign_claims(claims, new_key)
+            row.body, row.signature = receipt.body, receipt.signature
+            count += 1
     return count
-
-
-_RECEIPT = (ReceiptRow.body, ReceiptRow.signature)

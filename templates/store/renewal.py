@@ -10,8 +10,6 @@ another template, and two of them meet in the embedding.
 from dataclasses import dataclass
 from pathlib import Path
 
-from sqlalchemy.engine import Connection
-
 from templates.store.api_keys import ApiKeys
 from templates.store.audit_archive import Archive, write_archive
 from templates.store.audit_chain import begin_chain
@@ -47,19 +45,16 @@ def renew_secrets(context: StoreContext, api_keys: ApiKeys, archive: Path, *, by
     """
     old_receipt_key = context.secrets.get(SecretName.RECEIPT)
 
-    def work(connection: Connection) -> Renewed:
-        archived = write_archive(connection, context, archive, None)
+    with context.database.write() as session:
+        archived = write_archive(session, context, archive, None)
         fresh = {
-            name: context.secrets.renew(connection, name) for name in SecretName if name not in KEPT
+            name: context.secrets.draw(session, name) for name in SecretName if name not in KEPT
         }
-        refused = api_keys.authenticate_again(connection, fresh[SecretName.API_KEYS])
-        receipts = sign_again(connection, old_receipt_key, fresh[SecretName.RECEIPT])
+        refused = api_keys.authenticate_again(session, fresh[SecretName.API_KEYS])
+        receipts = sign_again(session, old_receipt_key, fresh[SecretName.RECEIPT])
         key = fresh[SecretName.CHAIN]
-        begin_chain(connection, key, archived.last)
-        context.audit_log.append(connection, Entry("secrets-renew", "renewed", by), key=key)
-        return Renewed(archived, receipts, refused)
-
-    renewed = context.database.write(work)
+        begin_chain(session, key, archived.last)
+        context.audit_log.append(session, Entry("secrets-renew", "renewed", by), key=key)
     context.secrets.load()
     context.database.purge_log()
-    return renewed
+    return Renewed(archived, receipts, refused)

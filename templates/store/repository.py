@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import sqlalchemy as sa
-from sqlalchemy.engine import Connection
+from sqlalchemy.orm import Session
 
 from templates.keys.sealing import MasterKeyring
 from templates.store import migrate
@@ -13,26 +13,18 @@ from templates.store.api_keys import ApiKeys
 from templates.store.attempts import Attempts
 from templates.store.audit_archive import Archive, archive_lines
 from templates.store.audit_chain import Anchor, BrokenAuditLog, begin_chain
-from templates.store.audit_log import PROGRAM, By, Verification
+from templates.store.audit_log import PROGRAM, By
+from templates.store.audit_verification import Verification, verify_audit_log
 from templates.store.context import StoreContext
 from templates.store.database import Database
 from templates.store.erasure import Erasures
-from templates.store.evidence import RecordProblem, verify_log_and_records
 from templates.store.identifiers import Clock, utc_now
 from templates.store.lockout import LockoutPolicy
 from templates.store.renewal import Renewed, renew_secrets
 from templates.store.rerotation import Rerotation
 from templates.store.retention import RetentionJob
 from templates.store.rewrap import WrappedKeys
-from templates.store.schema import (
-    ApiKeyRow,
-    AuditHeadRow,
-    FailedAttemptsRow,
-    RotationKeyRow,
-    SecretRow,
-    SubjectRow,
-    TemplateRow,
-)
+from templates.store.schema import AuditHeadRow, SecretRow
 from templates.store.secrets import SecretName
 from templates.store.subjects import Subjects
 from templates.store.tenants import Tenants
@@ -40,14 +32,6 @@ from templates.store.tenants import Tenants
 _LOCKOUT = LockoutPolicy()
 _TRIAL_NAME = "trial-write"
 _TRIAL_BYTES = 128 * 1024
-_HOLD_SUBJECT_DATA = (
-    SubjectRow,
-    TemplateRow,
-    FailedAttemptsRow,
-    RotationKeyRow,
-    ApiKeyRow,
-    SecretRow,
-)
 
 
 class TemplateStore:
@@ -89,20 +73,21 @@ class TemplateStore:
         :class:`SealError` if the database was made with another master key.
         """
         migrate.upgrade(self.database)
-        self.database.write(self._set_up)
+        with self.database.write() as session:
+            self._set_up(session)
         self.check()
 
-    def _set_up(self, connection: Connection) -> None:
-        made = self.secrets.make_missing(connection)
+    def _set_up(self, session: Session) -> None:
+        made = self.secrets.make_missing(session)
         if not made:
             return
-        has_begun = connection.execute(sa.select(AuditHeadRow.id)).first() is not None
+        has_begun = session.scalar(sa.select(AuditHeadRow.id)) is not None
         if has_begun or SecretName.CHAIN not in made:
             raise BrokenAuditLog(
                 f"secrets of the deployment are missing ({', '.join(sorted(made))}): "
                 "restore the database from a backup"
             )
-        begin_chain(connection, made[SecretName.CHAIN])
+        begin_chain(session, made[SecretName.CHAIN])
 
     def check(self) -> None:
         """Raise, naming the remedy, unless schema and master key are the right ones."""
@@ -112,11 +97,9 @@ class TemplateStore:
 
     def verify_audit_log(
         self, *, anchor: Anchor | None = None, progress: Callable[[int], None] | None = None
-    ) -> tuple[Verification, tuple[RecordProblem, ...]]:
-        """Walk over the audit log, and hold rows against it (:func:`verify_log_and_records`)."""
-        return verify_log_and_records(
-            self._context, self.api_keys, anchor=anchor, progress=progress
-        )
+    ) -> Verification:
+        """Walk over the audit log, and hold rows against it (:func:`verify_audit_log`)."""
+        return verify_audit_log(self._context, self.api_keys, anchor=anchor, progress=progress)
 
     def archive_audit_log(self, file: Path, *, through: int | None, by: By = PROGRAM) -> Archive:
         """Move old lines of the audit log into a file (:func:`archive_lines`)."""
@@ -132,7 +115,8 @@ class TemplateStore:
 
     def ping(self) -> None:
         """Raise :class:`StoreUnavailable` unless the database answers a query."""
-        self.database.read(lambda connection: connection.execute(sa.select(1)).one())
+        with self.database.read() as session:
+            session.execute(sa.select(1))
 
     def ping_write(self) -> None:
         """Raise :class:`StoreError` unless the database takes a write; nothing changes by it.
@@ -140,18 +124,12 @@ class TemplateStore:
         A full disk and a read-only database still answer queries. On a full disk a page or two
         often find room that an enrollment does not, so this writes as much as one.
         """
-        trial = sa.insert(SecretRow).values(
-            name=_TRIAL_NAME,
-            wrapped_value=os.urandom(_TRIAL_BYTES),
-            wrapping_key="",
-            created_at=self._context.clock(),
-        )
-
-        def work(connection: Connection) -> None:
-            connection.execute(trial)
-            connection.execute(sa.delete(SecretRow).where(SecretRow.name == _TRIAL_NAME))
-
-        self.database.write(work)
+        trial = SecretRow(name=_TRIAL_NAME, wrapped_key=os.urandom(_TRIAL_BYTES), wrapping_key="")
+        trial.created_at = self._context.clock()
+        with self.database.write() as session:
+            session.add(trial)
+            session.flush()
+            session.delete(trial)
 
     def purge(self) -> bool:
         """Remove expired records, and on SQLite empty the write-ahead log.
@@ -160,12 +138,3 @@ class TemplateStore:
         """
         self.attempts.expire()
         return self.database.purge_log()
-
-    def compact(self) -> None:
-        """Rewrite the tables of subjects and of keys, so that no page keeps what was erased.
-
-        PostgreSQL keeps a removed row in its page until it vacuums; ``VACUUM FULL`` writes new
-        files and locks each table meanwhile. SQLite overwrites as it deletes; there this gives
-        the free pages back to the file system.
-        """
-        self.database.compact([table.__tablename__ for table in _HOLD_SUBJECT_DATA])

@@ -5,8 +5,10 @@ of its own. That transaction asks once more whether the subject is still due, so
 enrolled again or accepted since the list was read survives.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
+from typing import Any
 
 import sqlalchemy as sa
 
@@ -42,24 +44,14 @@ class Retention:
 
     def expired(self, now: datetime) -> sa.ColumnElement[bool]:
         """Condition on a row of ``subjects``: it is due at this time."""
-        reasons: list[sa.ColumnElement[bool]] = []
+        reasons: list[sa.ColumnElement[bool]] = [sa.false()]
         if self.max_age is not None:
             reasons.append(SubjectRow.updated_at < now - self.max_age)
         if self.max_disuse is not None:
             since = now - self.max_disuse
-            unused = sa.or_(SubjectRow.last_used_at.is_(None), SubjectRow.last_used_at < since)
-            reasons.append(sa.and_(SubjectRow.updated_at < since, unused))
-        return sa.and_(SubjectRow.updated_at < self._enrolled_before(now), sa.or_(*reasons))
-
-    @property
-    def keeps_all(self) -> bool:
-        """Whether nobody is ever due."""
-        return self.max_age is None and self.max_disuse is None
-
-    def _enrolled_before(self, now: datetime) -> datetime:
-        # Follows from the reasons; said apart so that the index on the time is used.
-        limits = [limit for limit in (self.max_age, self.max_disuse) if limit is not None]
-        return now - min(limits)
+            last_used = sa.func.coalesce(SubjectRow.last_used_at, SubjectRow.updated_at)
+            reasons.append(sa.and_(SubjectRow.updated_at < since, last_used < since))
+        return sa.or_(*reasons)
 
 
 class RetentionJob:
@@ -75,37 +67,30 @@ class RetentionJob:
         It may be interrupted, run again, and run by several workers at once. `batch` subjects are
         listed at once.
         """
-        if retention.keeps_all:
-            return 0
-        database, erased, after = self._context.database, 0, ""
-        expired = retention.expired(self._context.clock())
-        due = (
+        erased, after, due = 0, "", retention.expired(self._context.clock())
+        query = (
             sa.select(SubjectRow.id, TenantRow.name.label("tenant"), SubjectRow.subject_id)
             .join(TenantRow, TenantRow.id == SubjectRow.tenant_id)
-            .where(expired)
+            .where(due)
             .order_by(SubjectRow.id)
             .limit(batch)
         )
-        while rows := database.read(
-            lambda connection, after=after: connection.execute(  # type: ignore[misc]
-                due.where(SubjectRow.id > after)
-            ).all()
-        ):
+        while rows := self._listed(query.where(SubjectRow.id > after)):
             for row in rows:
                 # The row, too: a subject of the same name may have been enrolled anew.
-                still_due = sa.and_(SubjectRow.id == row.id, expired)
-                receipt = self._erasures.erase_if(row.tenant, row.subject_id, still_due, by=by)
-                erased += receipt is not None
-            database.purge_log()
+                is_due = sa.and_(SubjectRow.id == row.id, due)
+                erased += self._erasures.erase_if(row.tenant, row.subject_id, is_due, by=by)
+            self._context.database.purge_log()
             after = rows[-1].id
         return erased
 
+    def _listed(self, query: Any) -> Sequence[Any]:
+        with self._context.database.read() as session:
+            return session.execute(query).all()
+
     def due(self, retention: Retention) -> int:
         """Count the subjects that :meth:`erase_expired` would erase now."""
-        if retention.keeps_all:
-            return 0
-        expired = retention.expired(self._context.clock())
-        query = sa.select(sa.func.count()).select_from(SubjectRow).where(expired)
-        return self._context.database.read(
-            lambda connection: connection.execute(query).scalar_one()
-        )
+        due = retention.expired(self._context.clock())
+        with self._context.database.read() as session:
+            query = sa.select(sa.func.count()).select_from(SubjectRow).where(due)
+            return session.execute(query).scalar_one()

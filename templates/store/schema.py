@@ -6,12 +6,14 @@ Receipts and audit lines outlive a subject: they name it by a keyed pseudonym on
 """
 
 from datetime import UTC, datetime
+from enum import StrEnum
 from typing import Annotated, Any, ClassVar
 
 from sqlalchemy import (
     BigInteger,
     DateTime,
     Dialect,
+    Enum,
     ForeignKey,
     Index,
     Integer,
@@ -23,7 +25,7 @@ from sqlalchemy import (
     UniqueConstraint,
     false,
 )
-from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
+from sqlalchemy.orm import DeclarativeBase, Load, Mapped, mapped_column
 
 PSEUDONYM = String(64)
 UUID_HEX = String(32)
@@ -36,6 +38,16 @@ RowId = Annotated[str, mapped_column(UUID_HEX, primary_key=True)]
 TenantId = Annotated[str, mapped_column(UUID_HEX, ForeignKey("tenants.id", ondelete="CASCADE"))]
 KeyId = Annotated[str, mapped_column(String(16))]
 Mac = Annotated[bytes, mapped_column(LargeBinary(32))]
+Sealed = Annotated[
+    bytes, mapped_column(deferred=True, deferred_group="sealed", deferred_raiseload=True)
+]
+
+
+class Source(StrEnum):
+    """What a template was made from."""
+
+    PHOTOS = "photos"
+    TEMPLATE = "template"
 
 
 class UtcDateTime(TypeDecorator[datetime]):
@@ -117,7 +129,11 @@ class ApiKeyRow(Base):
 
 
 class SubjectRow(Base):
-    """A subject, with the data key of its template, wrapped by a master key."""
+    """A subject with its one template, sealed under a data key that a master key wraps.
+
+    `holder_salt` is NULL where the template needs no holder's key. What is sealed is loaded only by
+    a query with the option :data:`SEALED`.
+    """
 
     __tablename__ = "subjects"
     __table_args__ = (
@@ -129,35 +145,24 @@ class SubjectRow(Base):
     id: Mapped[RowId]
     tenant_id: Mapped[TenantId]
     subject_id: Mapped[str] = mapped_column(SUBJECT_ID)
-    wrapped_key: Mapped[bytes]
-    wrapping_key: Mapped[KeyId]
-    created_at: Mapped[datetime]
-    updated_at: Mapped[datetime]
-    last_used_at: Mapped[datetime | None]
-
-
-class TemplateRow(Base):
-    """The one template of a subject, encrypted under the subject's data key.
-
-    `holder_salt` is NULL where the template needs no holder's key.
-    """
-
-    __tablename__ = "templates"
-
-    subject_pk: Mapped[str] = mapped_column(
-        UUID_HEX, ForeignKey("subjects.id", ondelete="CASCADE"), primary_key=True
-    )
     template_id: Mapped[str] = mapped_column(String(64))
-    contract_id: Mapped[str] = mapped_column(String(64), index=True)
+    contract_id: Mapped[str] = mapped_column(String(64))
     rotation_epoch: Mapped[int]
-    ciphertext: Mapped[bytes]
     n: Mapped[int]
     m: Mapped[int]
     dtype: Mapped[str] = mapped_column(String(16))
-    source: Mapped[str] = mapped_column(String(16))
+    source: Mapped[Source] = mapped_column(Enum(Source, native_enum=False, length=16))
     photos: Mapped[int]
     holder_salt: Mapped[str | None] = mapped_column(UUID_HEX)
     created_at: Mapped[datetime]
+    updated_at: Mapped[datetime]
+    last_used_at: Mapped[datetime | None]
+    wrapping_key: Mapped[KeyId]
+    wrapped_key: Mapped[Sealed]
+    ciphertext: Mapped[Sealed]
+
+
+SEALED = Load(SubjectRow).undefer_group("sealed")
 
 
 class FailedAttemptsRow(Base):
@@ -234,6 +239,6 @@ class SecretRow(Base):
     __tablename__ = "secrets"
 
     name: Mapped[str] = mapped_column(String(64), primary_key=True)
-    wrapped_value: Mapped[bytes]
+    wrapped_key: Mapped[bytes]
     wrapping_key: Mapped[KeyId]
     created_at: Mapped[datetime]

@@ -2,10 +2,9 @@
 
 import os
 from enum import StrEnum
-from typing import Any
 
 import sqlalchemy as sa
-from sqlalchemy.engine import Connection
+from sqlalchemy.orm import Session
 
 from templates.errors import SealError, StoreError
 from templates.keys.sealing import MasterKeyring, sealed_key_id
@@ -50,38 +49,34 @@ class Secrets:
 
     def load(self) -> None:
         """Read and open all secrets; :class:`SealError` under another master key."""
-        query = sa.select(SecretRow.name, SecretRow.wrapped_value)
-        rows = self._database.read(lambda connection: connection.execute(query).all())
+        with self._database.read() as session:
+            rows = session.scalars(sa.select(SecretRow)).all()
         try:
             self._opened = {
-                name: self._keyring.open(sealed, purpose=SECRET_PURPOSE, bound_to=[name])
-                for name, sealed in rows
+                row.name: self._keyring.open(
+                    row.wrapped_key, purpose=SECRET_PURPOSE, bound_to=[row.name]
+                )
+                for row in rows
             }
         except SealError as error:
             raise SealError(f"this is not the master key of this database: {error}") from None
 
-    def make_missing(self, connection: Connection) -> dict[SecretName, bytes]:
+    def make_missing(self, session: Session) -> dict[SecretName, bytes]:
         """Draw the secrets that the database lacks, in a write; returns them by name."""
-        present = set(connection.execute(sa.select(SecretRow.name)).scalars())
-        made = {}
-        for name in SecretName:
-            if name not in present:
-                made[name], columns = self._drawn(name)
-                row = {"name": name, "created_at": self._clock(), **columns}
-                connection.execute(sa.insert(SecretRow).values(row))
-        return made
+        present = set(session.scalars(sa.select(SecretRow.name)))
+        return {name: self.draw(session, name) for name in SecretName if name not in present}
 
-    def renew(self, connection: Connection, name: SecretName) -> bytes:
-        """Draw a secret anew, in a write; every process reads it when it starts again."""
-        secret, columns = self._drawn(name)
-        connection.execute(sa.update(SecretRow).where(SecretRow.name == name).values(columns))
-        return secret
+    def draw(self, session: Session, name: SecretName) -> bytes:
+        """Draw a secret, in a write, in place of an earlier one.
 
-    def _drawn(self, name: SecretName) -> tuple[bytes, dict[str, Any]]:
-        """A new secret, and the columns that it is kept in."""
+        Every process that runs has to start again to read it.
+        """
         secret = os.urandom(SECRET_BYTES)
         sealed = self._keyring.seal(secret, purpose=SECRET_PURPOSE, bound_to=[name])
-        return secret, {"wrapped_value": sealed, "wrapping_key": sealed_key_id(sealed)}
+        row = SecretRow(name=name, wrapped_key=sealed, created_at=self._clock())
+        row.wrapping_key = sealed_key_id(sealed)
+        session.merge(row)
+        return secret
 
     def __repr__(self) -> str:
         return "Secrets()"

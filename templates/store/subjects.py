@@ -1,41 +1,28 @@
 """Subjects and their templates: put, get, describe, list."""
 
 import uuid
-from dataclasses import dataclass
-from datetime import datetime
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import sqlalchemy as sa
-from sqlalchemy.engine import Connection
+from sqlalchemy.orm import Session
 
 from templates.errors import StoreBusy, StoreError
-from templates.keys.sealing import sealed_key_id
+from templates.keys.sealing import MasterKeyring
 from templates.store.audit_log import PROGRAM, By, Entry, is_used, template_digest
 from templates.store.context import StoreContext
 from templates.store.cursors import close_cursor, open_cursor
-from templates.store.envelope import Envelope, Owner, close_envelope
+from templates.store.envelope import open_template, seal_template
 from templates.store.identifiers import (
     InvalidIdentifier,
-    checked_opaque_id,
     checked_subject_id,
     checked_subject_prefix,
 )
 from templates.store.lockout import Replayed
-from templates.store.schema import SubjectRow, TemplateRow
-from templates.store.subject_rows import (
-    RECORD_COLUMNS,
-    TEMPLATE_COLUMNS,
-    Source,
-    SubjectRecord,
-    SubjectTemplate,
-    opened_template,
-    read_record,
-    select_subjects,
-    subject_pk_of,
-)
+from templates.store.schema import SEALED, Source, SubjectRow, TenantRow
 from templates.store.tenants import tenant_of
 
-MAX_WIRE_BYTES = 4 * 1024 * 1024  # a float32 template of n = 4096, m = 192 has 3.2 MB
 MAX_PAGE = 1000
 
 _CURSOR_PURPOSE = "list-cursor"
@@ -71,6 +58,24 @@ class Precondition:
 
 
 @dataclass(frozen=True)
+class SubjectTemplate:
+    """A subject with its decrypted template; the wire bytes stay out of its repr."""
+
+    record: SubjectRow
+    wire: bytes = field(repr=False)
+
+    @property
+    def template_id(self) -> str:
+        """Id of the template, which its rotation is derived from."""
+        return self.record.template_id
+
+    @property
+    def holder_salt(self) -> str | None:
+        """What its holder's rotation is derived from, with their key; None if it needs no key."""
+        return self.record.holder_salt
+
+
+@dataclass(frozen=True)
 class StoredTemplate:
     """What :meth:`Subjects.put` did."""
 
@@ -82,7 +87,7 @@ class StoredTemplate:
 class SubjectPage:
     """One page of subjects; `next_cursor` is None on the last one."""
 
-    records: tuple[SubjectRecord, ...]
+    records: Sequence[SubjectRow]
     next_cursor: str | None
 
 
@@ -117,7 +122,7 @@ class Subjects:
         Parameters
         ----------
         wire
-            The template's wire bytes, 4 MiB at most.
+            The template's wire bytes.
         contract_id, n, m, dtype, source, photos
             Metadata that stays readable without a key.
         template_id
@@ -142,84 +147,62 @@ class Subjects:
         an old backup of one of the two rows does not help to read the other.
         """
         subject_id = checked_subject_id(subject_id)
-        checked_opaque_id(contract_id, what="contract id")
-        template_id = checked_opaque_id(template_id, what="template id")
-        if not 0 < len(wire) <= MAX_WIRE_BYTES:
-            raise StoreError(
-                f"a template has 1 to {MAX_WIRE_BYTES} wire bytes, this has {len(wire)}"
-            )
         context = self._context
         pseudonym = context.signer.pseudonym(tenant, subject_id)
-
-        def work(connection: Connection) -> StoredTemplate:
-            owner_tenant = tenant_of(connection, tenant)
-            epoch = owner_tenant.rotation_epoch
-            if rotation_epoch not in (None, epoch):
+        with context.database.write() as session:
+            owner, now = tenant_of(session, tenant), context.clock()
+            if rotation_epoch not in (None, owner.rotation_epoch):
                 raise StoreBusy("the tenant's rotation was renewed meanwhile; send it again")
-            enrolled_pk = subject_pk_of(connection, owner_tenant.id, subject_id)
-            if precondition is not None:
-                enrolled = connection.execute(_TEMPLATE_ID, {"pk": enrolled_pk}).scalar()
-                if enrolled != precondition.template_id:
-                    raise EnrollmentConflict(enrolled)
-            if token is not None and is_used(connection, token):
+            subject = subject_of(session, tenant, subject_id)
+            enrolled = None if subject is None else subject.template_id
+            if precondition is not None and enrolled != precondition.template_id:
+                raise EnrollmentConflict(enrolled)
+            if token is not None and is_used(session, token):
                 raise Replayed
-            is_new, subject_pk = enrolled_pk is None, enrolled_pk or uuid.uuid4().hex
-            owner = Owner(
-                owner_tenant.id,
-                subject_pk,
-                subject_id,
-                contract_id,
-                template_id,
-                epoch,
-                holder_salt,
-            )
+            created = subject is None
+            if subject is None:
+                subject = SubjectRow(id=uuid.uuid4().hex, tenant_id=owner.id, created_at=now)
+                subject.subject_id = subject_id
+                session.add(subject)
+            subject.template_id = template_id
+            subject.contract_id = contract_id
+            subject.rotation_epoch = owner.rotation_epoch
+            subject.n, subject.m, subject.dtype = n, m, dtype
+            subject.source, subject.photos = source, photos
+            subject.holder_salt = holder_salt
+            subject.updated_at = now
             # Sealed here: a rotation of the master key that ends later finds it.
-            envelope = close_envelope(wire, owner, context.keyring)
-            metadata = {"n": n, "m": m, "dtype": dtype, "source": Source(source), "photos": photos}
-            now = context.clock()
-            _write_rows(connection, owner, envelope, metadata, is_new=is_new, now=now)
-            outcome = "created" if is_new else "replaced"
+            seal_template(subject, wire, context.keyring)
+            outcome = "created" if created else "replaced"
             detail = template_digest(template_id)
             entry = Entry(action, outcome, by, tenant, pseudonym, detail, token)
-            context.audit_log.append(connection, entry)
-            return StoredTemplate(template_id, is_new)
-
-        stored = context.database.write(work)
-        if not stored.created:
+            context.audit_log.append(session, entry)
+        if not created:
             context.database.purge_log()
-        return stored
+        return StoredTemplate(template_id, created)
 
     def record_export(self, tenant: str, subject_id: str, *, template_id: str, by: By) -> None:
         """Write the line of an export; :class:`StoreBusy` if it is no longer the subject's."""
         context = self._context
-        query = select_subjects((TemplateRow.template_id,), tenant).where(
-            SubjectRow.subject_id == checked_subject_id(subject_id)
-        )
         pseudonym = context.signer.pseudonym(tenant, subject_id)
-
-        def work(connection: Connection) -> None:
-            if connection.execute(query).scalar_one_or_none() != template_id:
+        with context.database.write() as session:
+            subject = subject_of(session, tenant, checked_subject_id(subject_id))
+            if subject is None or subject.template_id != template_id:
                 raise StoreBusy("the subject was enrolled again or erased meanwhile: send it again")
-            context.audit_log.append(connection, Entry("export", "exported", by, tenant, pseudonym))
-
-        context.database.write(work)
+            context.audit_log.append(session, Entry("export", "exported", by, tenant, pseudonym))
 
     def get(self, tenant: str, subject_id: str) -> SubjectTemplate | None:
         """Return a subject with its decrypted template, or None."""
-        row = self._row(TEMPLATE_COLUMNS, tenant, subject_id)
-        return None if row is None else opened_template(row, self._context.keyring)
+        subject_id = checked_subject_id(subject_id)
+        with self._context.database.read() as session:
+            subject = subject_of(session, tenant, subject_id, SEALED)
+        return None if subject is None else opened_template(subject, self._context.keyring)
 
-    def describe(self, tenant: str, subject_id: str) -> SubjectRecord | None:
+    def describe(self, tenant: str, subject_id: str) -> SubjectRow | None:
         """Return a subject's metadata, or None; nothing is decrypted."""
-        row = self._row(RECORD_COLUMNS, tenant, subject_id)
-        return None if row is None else read_record(row)
-
-    def _row(self, columns: tuple[Any, ...], tenant: str, subject_id: str) -> Any:
-        subject = SubjectRow.subject_id == checked_subject_id(subject_id)
-        query = select_subjects(columns, tenant).where(subject)
-        return self._context.database.read(
-            lambda connection: connection.execute(query).one_or_none()
-        )
+        subject_id = checked_subject_id(subject_id)
+        with self._context.database.read() as session:
+            return subject_of(session, tenant, subject_id)
 
     def list(
         self, tenant: str, *, limit: int = 100, cursor: str | None = None, prefix: str = ""
@@ -240,9 +223,7 @@ class Subjects:
         """
         if not 1 <= limit <= MAX_PAGE:
             raise InvalidIdentifier(f"the limit of a page is 1 to {MAX_PAGE}")
-        query = (
-            select_subjects(RECORD_COLUMNS, tenant).order_by(SubjectRow.subject_id).limit(limit + 1)
-        )
+        query = _of_tenant(tenant).order_by(SubjectRow.subject_id).limit(limit + 1)
         keyring = self._context.keyring
         if cursor is not None:
             after = open_cursor(keyring, cursor, purpose=_CURSOR_PURPOSE, tenant=tenant)
@@ -251,8 +232,9 @@ class Subjects:
             # A range, which the index of the ids serves: no id has the last of all characters.
             first = checked_subject_prefix(prefix)
             query = query.where(SubjectRow.subject_id.between(first, f"{first}\U0010ffff"))
-        rows = self._context.database.read(lambda connection: connection.execute(query).all())
-        records = tuple(read_record(row) for row in rows[:limit])
+        with self._context.database.read() as session:
+            rows = session.scalars(query).all()
+        records = rows[:limit]
         if len(rows) <= limit:
             return SubjectPage(records, None)
         last = records[-1].subject_id
@@ -261,47 +243,20 @@ class Subjects:
         )
 
 
-_TEMPLATE_ID = sa.select(TemplateRow.template_id).where(
-    TemplateRow.subject_pk == sa.bindparam("pk")
-)
+def subject_of(session: Session, tenant: str, subject_id: str, *options: Any) -> SubjectRow | None:
+    """A subject of a tenant, by its id in NFC, or None."""
+    query = _of_tenant(tenant).where(SubjectRow.subject_id == subject_id).options(*options)
+    return session.scalars(query).one_or_none()
 
 
-def _write_rows(
-    connection: Connection,
-    owner: Owner,
-    envelope: Envelope,
-    metadata: dict[str, Any],
-    *,
-    is_new: bool,
-    now: datetime,
-) -> None:
-    """Insert a subject and its template, or replace the template and the data key there are."""
-    key_columns = {
-        "wrapped_key": envelope.wrapped_key,
-        "wrapping_key": sealed_key_id(envelope.wrapped_key),
-        "updated_at": now,
-    }
-    if is_new:
-        identity = {
-            "id": owner.subject_pk,
-            "tenant_id": owner.tenant_id,
-            "subject_id": owner.subject_id,
-        }
-        connection.execute(sa.insert(SubjectRow).values(**identity, created_at=now, **key_columns))
-    else:
-        connection.execute(
-            sa.update(SubjectRow).where(SubjectRow.id == owner.subject_pk).values(**key_columns)
-        )
-        connection.execute(sa.delete(TemplateRow).where(TemplateRow.subject_pk == owner.subject_pk))
-    connection.execute(
-        sa.insert(TemplateRow).values(
-            subject_pk=owner.subject_pk,
-            template_id=owner.template_id,
-            contract_id=owner.contract_id,
-            rotation_epoch=owner.rotation_epoch,
-            holder_salt=owner.holder_salt,
-            ciphertext=envelope.ciphertext,
-            created_at=now,
-            **metadata,
-        )
+def opened_template(subject: SubjectRow, keyring: MasterKeyring) -> SubjectTemplate:
+    """Decrypt a subject's template; :class:`SealError` as of :func:`open_template`."""
+    return SubjectTemplate(subject, open_template(subject, keyring))
+
+
+def _of_tenant(tenant: str) -> sa.Select[SubjectRow]:
+    return (
+        sa.select(SubjectRow)
+        .join(TenantRow, TenantRow.id == SubjectRow.tenant_id)
+        .where(TenantRow.name == tenant)
     )

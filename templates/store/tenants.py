@@ -7,12 +7,11 @@ enrollment that was under way, cannot mistake one for the other.
 
 import os
 import uuid
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from datetime import datetime
-from typing import Any
 
 import sqlalchemy as sa
-from sqlalchemy.engine import Connection
+from sqlalchemy.orm import Session
 
 from templates.errors import StoreError
 from templates.keys.sealing import sealed_key_id
@@ -23,25 +22,6 @@ from templates.store.receipts import latest_receipt, tenant_receipt_name, verify
 from templates.store.schema import RotationKeyRow, TenantRow
 
 ROTATION_PURPOSE = "tenant-rotation-key"
-
-
-@dataclass(frozen=True)
-class Tenant:
-    """A tenant.
-
-    Attributes
-    ----------
-    rotation_epoch
-        Epoch whose key new templates are turned by.
-    template_enrollment
-        Whether clients may enroll templates that they made themselves.
-    """
-
-    id: str
-    name: str
-    rotation_epoch: int
-    created_at: datetime
-    template_enrollment: bool
 
 
 @dataclass(frozen=True)
@@ -62,83 +42,66 @@ class Tenants:
     def __init__(self, context: StoreContext) -> None:
         self._context = context
 
-    def create(self, name: str) -> Tenant:
+    def create(self, name: str) -> TenantRow:
         """Return the tenant of this name, which is made, with its rotation key, if it is new."""
         checked_tenant_name(name)
-        return self._context.database.write(lambda connection: self.ensure(connection, name))
+        with self._context.database.write() as session:
+            tenant = session.scalars(_OF_NAME, {"name": name}).one_or_none()
+            if tenant is None:
+                tenant = TenantRow(
+                    id=uuid.uuid4().hex,
+                    name=name,
+                    rotation_epoch=1 + self._last_epoch_of_erased(session, name),
+                    created_at=self._context.clock(),
+                    template_enrollment=False,
+                )
+                session.add(tenant)
+                session.flush()
+                self.add_rotation_key(session, tenant)
+            return tenant
 
-    def ensure(self, connection: Connection, name: str) -> Tenant:
-        """:meth:`create` inside a write."""
-        row = connection.execute(_TENANTS.where(TenantRow.name == name)).one_or_none()
-        if row is not None:
-            return Tenant(**row._mapping)
-        tenant = Tenant(
-            id=uuid.uuid4().hex,
-            name=name,
-            rotation_epoch=1 + self._last_epoch_of_erased(connection, name),
-            created_at=self._context.clock(),
-            template_enrollment=False,
-        )
-        connection.execute(sa.insert(TenantRow).values(vars(tenant)))
-        self.add_rotation_key(connection, tenant.id, tenant.rotation_epoch)
-        return tenant
-
-    def get(self, name: str) -> Tenant:
+    def get(self, name: str) -> TenantRow:
         """Return a tenant, or raise :class:`UnknownTenant`."""
-        return self._context.database.read(lambda connection: tenant_of(connection, name))
+        with self._context.database.read() as session:
+            return tenant_of(session, name)
 
-    def all(self) -> tuple[Tenant, ...]:
+    def all(self) -> Sequence[TenantRow]:
         """Every tenant, by name."""
-        query = _TENANTS.order_by(TenantRow.name)
-        rows = self._context.database.read(lambda connection: connection.execute(query).all())
-        return tuple(Tenant(**row._mapping) for row in rows)
+        with self._context.database.read() as session:
+            return session.scalars(sa.select(TenantRow).order_by(TenantRow.name)).all()
 
-    def set_template_enrollment(self, name: str, allowed: bool, *, by: By = PROGRAM) -> Tenant:
+    def set_template_enrollment(self, name: str, allowed: bool, *, by: By = PROGRAM) -> None:
         """Allow clients of a tenant to enroll templates that they made themselves, or forbid it."""
         outcome = "template-enrollment-on" if allowed else "template-enrollment-off"
-        entry = Entry("tenant-settings", outcome, by, checked_tenant_name(name))
-
-        def work(connection: Connection) -> Tenant:
-            tenant = tenant_of(connection, name)
-            change = sa.update(TenantRow).where(TenantRow.id == tenant.id)
-            connection.execute(change.values(template_enrollment=allowed))
-            self._context.audit_log.append(connection, entry)
-            return tenant_of(connection, name)
-
-        return self._context.database.write(work)
+        with self._context.database.write() as session:
+            tenant_of(session, name).template_enrollment = allowed
+            self._context.audit_log.append(session, Entry("tenant-settings", outcome, by, name))
 
     def rotation_key(self, name: str, *, epoch: int | None = None) -> RotationKey:
-        """Open the rotation key of a tenant, of the current epoch unless another is asked for.
+        """Return the key of a tenant's epoch, by default of the current one.
 
-        Raises
-        ------
-        UnknownTenant
-        RetiredRotation
-            Where there is no key of this epoch any more.
+        :class:`RetiredRotation` where the epoch has none any more.
         """
-        tenant = self.get(name)
-        epoch = tenant.rotation_epoch if epoch is None else epoch
-        query = sa.select(RotationKeyRow.wrapped_key).where(
-            RotationKeyRow.tenant_id == tenant.id, RotationKeyRow.epoch == epoch
-        )
-        wrapped = self._context.database.read(
-            lambda connection: connection.execute(query).scalar_one_or_none()
-        )
-        if wrapped is None:
+        with self._context.database.read() as session:
+            tenant = tenant_of(session, name)
+            epoch = tenant.rotation_epoch if epoch is None else epoch
+            row = session.get(RotationKeyRow, (tenant.id, epoch))
+        if row is None:
             raise RetiredRotation(f"tenant {name!r} has no rotation key of epoch {epoch}")
         key = self._context.keyring.open(
-            wrapped, purpose=ROTATION_PURPOSE, bound_to=[tenant.id, epoch]
+            row.wrapped_key, purpose=ROTATION_PURPOSE, bound_to=[tenant.id, epoch]
         )
         return RotationKey(epoch=epoch, key=key)
 
-    def add_rotation_key(self, connection: Connection, tenant_id: str, epoch: int) -> None:
-        """Draw the key of a new epoch inside a write."""
+    def add_rotation_key(self, session: Session, tenant: TenantRow) -> None:
+        """Draw the key of a tenant's current epoch, a new one, in a write."""
+        epoch = tenant.rotation_epoch
         wrapped = self._context.keyring.seal(
-            os.urandom(32), purpose=ROTATION_PURPOSE, bound_to=[tenant_id, epoch]
+            os.urandom(32), purpose=ROTATION_PURPOSE, bound_to=[tenant.id, epoch]
         )
-        connection.execute(
-            sa.insert(RotationKeyRow).values(
-                tenant_id=tenant_id,
+        session.add(
+            RotationKeyRow(
+                tenant_id=tenant.id,
                 epoch=epoch,
                 wrapped_key=wrapped,
                 wrapping_key=sealed_key_id(wrapped),
@@ -146,9 +109,9 @@ class Tenants:
             )
         )
 
-    def _last_epoch_of_erased(self, connection: Connection, name: str) -> int:
+    def _last_epoch_of_erased(self, session: Session, name: str) -> int:
         """Last epoch of the latest tenant of this name that was erased, by its receipt; else 0."""
-        receipt = latest_receipt(connection, tenant_receipt_name(name))
+        receipt = latest_receipt(session, tenant_receipt_name(name))
         if receipt is None:
             return 0
         claims = verify_receipt(receipt, self._context.signer.public_key())
@@ -157,13 +120,12 @@ class Tenants:
         return int(claims["rotation_epoch"])
 
 
-def tenant_of(connection: Connection, name: str) -> Tenant:
+def tenant_of(session: Session, name: str) -> TenantRow:
     """Read a tenant, or raise :class:`UnknownTenant`."""
-    row = connection.execute(_OF_NAME, {"name": name}).one_or_none()
-    if row is None:
+    tenant = session.scalars(_OF_NAME, {"name": name}).one_or_none()
+    if tenant is None:
         raise UnknownTenant.of_name(name)
-    return Tenant(**row._mapping)
+    return tenant
 
 
-_TENANTS: Any = sa.select(*(getattr(TenantRow, name) for name in Tenant.__dataclass_fields__))
-_OF_NAME = _TENANTS.where(TenantRow.name == sa.bindparam("name"))
+_OF_NAME = sa.select(TenantRow).where(TenantRow.name == sa.bindparam("name"))

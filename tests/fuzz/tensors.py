@@ -16,7 +16,7 @@ from templates.contract import wire
 from templates.keys.randomness import Keystream
 from templates.keys.sealing import KeyringSealer, MasterKeyring
 from templates.space.subspace import SubspaceBatch
-from templates.store.subject_rows import Source
+from templates.store.schema import Source
 from tests.fuzz.documents import Raw, hostile
 from tests.fuzz.mutations import mutated, some, span
 

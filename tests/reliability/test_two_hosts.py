@@ -173,5 +173,5 @@ def decide_as_one(cluster: Cluster, first: Host, second: Host) -> None:
     assert knows_of_the_lock("dan", b)
     wait_until(lambda: describe(second, exhausted) == 429)
     store = open_store(settings, open_keyring(settings))
-    assert store.audit_log.verify().intact
+    assert store.verify_audit_log().intact
     store.close()

@@ -11,7 +11,7 @@ from api.http.schemas import EnrollmentAnswer, Photo
 from enroll import Holder
 from enroll.enroller import MAX_PHOTOS
 from templates.keys.holder_key import wipe
-from templates.store.subject_rows import Source
+from templates.store.schema import Source
 
 router = APIRouter(prefix="/v1/subjects", tags=["Enroll and verify"])
 

@@ -17,7 +17,7 @@ from api.http.schemas import (
     UnlockAnswer,
 )
 from templates.contract.document import Binding
-from templates.store.subject_rows import SubjectRecord
+from templates.store.schema import SubjectRow
 
 router = APIRouter(prefix="/v1/subjects", tags=["People"])
 
@@ -106,7 +106,7 @@ async def unlock_subject(call: Administers, subject: SubjectDep) -> UnlockAnswer
     return UnlockAnswer(lifted=lifted)
 
 
-def _described(record: SubjectRecord, binding: Binding) -> dict[str, Any]:
+def _described(record: SubjectRow, binding: Binding) -> dict[str, Any]:
     return {
         "subject_id": record.subject_id,
         "template_id": record.template_id,

@@ -13,7 +13,7 @@ from api.http.requests import ImportJson
 from api.http.schemas import ExportAnswer, ImportAnswer
 from api.http.transfer import open_export
 from templates.store.identifiers import checked_subject_id
-from templates.store.subject_rows import Source
+from templates.store.schema import Source
 
 router = APIRouter(prefix="/v1/subjects", tags=["People"])
 

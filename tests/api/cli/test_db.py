@@ -26,8 +26,7 @@ def test_upgrade_and_check(tmp_path):
         "after": head_revision(),
     }
     assert "up to date" in run("db", "upgrade", *where).stdout
-    compacted = run("db", "compact", *where, "--json").json
-    assert compacted["bytes_after"] <= compacted["bytes_before"]
+    assert run("db", "compact", *where, "--json").json == {"compacted": True}
     checked = run("db", "check", *where, "--json")
     assert (checked.status, checked.json["current"]) == (0, head_revision())
 

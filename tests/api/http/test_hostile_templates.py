@@ -16,7 +16,7 @@ from attacks.stored.wolves import canonical
 from models.pack import ModelPack
 from templates.contract import wire
 from templates.space.subspace import SubspaceBatch
-from templates.store.subject_rows import Source
+from templates.store.schema import Source
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, deploy
 from tests.api.shapes import assert_answer, assert_error

@@ -23,7 +23,7 @@ from templates.keys.sealing import MasterKeyring
 from templates.space.subspace import SubspaceBatch
 from templates.store import Right, TemplateStore
 from templates.store.audit_archive import verify_archive
-from templates.store.audit_chain import Anchor, Head, head_columns, line_mac
+from templates.store.audit_chain import Anchor, Head, line_mac
 from templates.store.audit_log import Line
 from templates.store.database import Database
 from templates.store.receipts import sign_claims
@@ -33,6 +33,7 @@ from tests.api.cli.conftest import run
 from tests.api.client import Client
 from tests.api.deployment import AXES, Deployment, bearer, deploy, images, photo, picture
 from tests.api.shapes import assert_error
+from tests.databases import execute
 
 FORGET_MADE_UP = "DELETE FROM api_keys WHERE label = 'made up'"
 PEOPLE = {"alice": 1, "bob": 2}
@@ -82,8 +83,8 @@ class Thief:
         """Make a key with the stolen secrets, and put its row into the service's database."""
         new = self.store.api_keys.create("default", ["admin", "erase", "verify"], label="made up")
         row = _read(self.store.database, ApiKeyRow, ApiKeyRow.label == "made up")
-        database.write(lambda connection: connection.execute(sa.insert(ApiKeyRow).values(row)))
-        self.store.database.write(lambda connection: connection.execute(sa.text(FORGET_MADE_UP)))
+        execute(database, sa.insert(ApiKeyRow).values(row))
+        execute(self.store.database, FORGET_MADE_UP)
         return new.token
 
     def write_line(self, database: Database) -> None:
@@ -96,17 +97,14 @@ class Thief:
         line |= {"actor": "program", "at": datetime.now(UTC).isoformat()}
         line["mac"] = line_mac(key, line, last.mac)
         base = Anchor(row["base_sequence"], row["base_mac"])
-        head = head_columns(Head(base, Anchor(line["sequence"], line["mac"])), key)
-        for statement in (
-            sa.insert(AuditRow).values(line),
-            sa.update(AuditHeadRow).values(head),
-        ):
-            database.write(lambda connection, made=statement: connection.execute(made))
+        head = Head(base, Anchor(line["sequence"], line["mac"])).columns(key)
+        execute(database, sa.insert(AuditRow).values(line), sa.update(AuditHeadRow).values(head))
 
 
 def _read(database: Database, table: type[Any], condition: Any) -> dict[str, Any]:
     query = sa.select(table.__table__).where(condition)
-    return database.read(lambda connection: connection.execute(query).one()._asdict())
+    (row,) = execute(database, query)
+    return dict(row._asdict())
 
 
 def unit_vectors(
@@ -192,7 +190,7 @@ def test_the_drill(tmp_path: Path) -> None:
         assert client.get("/v1/audit-log", headers=bearer(made_up)).status_code == 200
 
     # The service is stopped.
-    service.write(lambda connection: connection.execute(sa.text(FORGET_MADE_UP)))
+    execute(service, FORGET_MADE_UP)
     archive = tmp_path / "before.jsonl"
     done = operator(deployment, "keys", "renew", str(archive))
     prefix = deployment.token[3:15]
@@ -213,7 +211,7 @@ def test_the_drill(tmp_path: Path) -> None:
         # Nothing that the stolen secrets make is good for anything.
         made_up = thief.made_up_key(service)
         assert_error(client.get("/v1/contract", headers=bearer(made_up)), 401, "unauthorized")
-        service.write(lambda connection: connection.execute(sa.text(FORGET_MADE_UP)))
+        execute(service, FORGET_MADE_UP)
         before, contract = contract, client.get("/v1/contract", headers=bearer(token)).json()
         again = client.delete("/v1/subjects/carol", headers=bearer(token)).json()
         assert again["claims"]["receipt_id"] == receipt["claims"]["receipt_id"]

@@ -8,13 +8,13 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
-import sqlalchemy as sa
 
 from templates.store.database import Database
 from tests.api.calls import attempt, enroll
 from tests.api.client import Client
 from tests.api.deployment import Deployment
 from tests.api.shapes import assert_error
+from tests.databases import execute
 
 Run = Callable[..., list[Any]]
 
@@ -24,14 +24,7 @@ def run(both: tuple[Client, Deployment]) -> Iterator[Run]:
     """Runs a statement of the attacker's."""
     database = Database(both[1].settings.resolved_database_url)
 
-    def execute(statement: str, **values: object) -> list[Any]:
-        def work(connection: sa.Connection) -> list[Any]:
-            result = connection.execute(sa.text(statement), values)
-            return [row._asdict() for row in result] if result.returns_rows else []
-
-        return database.write(work)
-
-    yield execute
+    yield lambda *statements, **values: execute(database, *statements, **values)
     database.close()
 
 
@@ -44,9 +37,9 @@ def test_a_token_whose_use_was_forgotten_is_taken_again_and_reported(
     token = client.post("/v1/tokens", json=asked).json()["token"]
     assert attempt(client, token, 1).status_code == 200
     assert_error(attempt(client, token, 1), 401, "replayed")
-    assert client.app.state.runtime.store.verify_audit_log()[0].problem is None
+    assert client.app.state.runtime.store.verify_audit_log().problem is None
     run("UPDATE audit_log SET token = NULL")
     assert attempt(client, token, 1).status_code == 200
-    problem = client.app.state.runtime.store.verify_audit_log()[0].problem
+    problem = client.app.state.runtime.store.verify_audit_log().problem
     assert problem is not None
     assert problem.what == "altered"

@@ -15,6 +15,7 @@ from templates.store import By, TemplateStore
 from templates.store.schema import FailedAttemptsRow, SubjectRow
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, deploy, images, photo
+from tests.databases import execute
 from tests.patience import wait_until
 
 
@@ -30,13 +31,12 @@ def own(tmp_path: Path) -> Deployment:
 
 def records(store: TemplateStore) -> int:
     count = sa.select(sa.func.count()).select_from(FailedAttemptsRow)
-    return store.database.read(lambda each: each.execute(count).scalar_one())
+    return int(execute(store.database, count)[0][0])
 
 
 def expire_all(store: TemplateStore) -> None:
     at = sa.func.datetime("now", "-91 days")
-    changed = sa.update(FailedAttemptsRow).values(last_failed_at=at)
-    store.database.write(lambda each: each.execute(changed))
+    execute(store.database, sa.update(FailedAttemptsRow).values(last_failed_at=at))
 
 
 def fail(store: TemplateStore, subject: str) -> None:
@@ -101,7 +101,7 @@ def test_subjects_whose_time_is_over_go_by_themselves(
         store = client.app.state.runtime.store
         month_ago = datetime.now(UTC) - timedelta(days=31)
         old = sa.update(SubjectRow).values(updated_at=month_ago)
-        store.database.write(lambda each: each.execute(old.where(SubjectRow.subject_id == "old")))
+        execute(store.database, old.where(SubjectRow.subject_id == "old"))
         wait_until(lambda: client.get("/v1/subjects/old").status_code == 404)
         assert client.get("/v1/subjects/young").status_code == 200
         assert store.erasures.receipt("default", "old") is not None

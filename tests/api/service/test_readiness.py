@@ -2,10 +2,10 @@
 
 import json
 import time
+from itertools import product
 from typing import Any
 
 import pytest
-import sqlalchemy as sa
 
 from api.http.app import create_app
 from api.service.metrics import MODEL_UP, STORE_UP
@@ -14,9 +14,11 @@ from templates.store import TemplateStore
 from tests.api.client import Client
 from tests.api.deployment import Deployment, images, photo
 from tests.api.shapes import assert_error
+from tests.databases import execute
 from tests.patience import wait_until
 
 READY = "/health/ready"
+EVENTS = ("INSERT", "UPDATE")
 
 
 # Readiness
@@ -24,38 +26,23 @@ READY = "/health/ready"
 
 def refuse_writes(store: TemplateStore, *tables: str) -> None:
     """Let the database itself refuse to write, as one does that is full or read-only."""
-
-    def work(connection: sa.Connection) -> None:
-        if connection.dialect.name != "sqlite":
-            connection.execute(
-                sa.text(
-                    "CREATE FUNCTION no_room() RETURNS trigger LANGUAGE plpgsql AS "
-                    "$$ BEGIN RAISE EXCEPTION USING ERRCODE = '53100'; END $$"
-                )
-            )
-        for table in tables:
-            for event in ("INSERT", "UPDATE"):
-                does = (
-                    "BEGIN SELECT RAISE(ABORT, 'full'); END"
-                    if connection.dialect.name == "sqlite"
-                    else "FOR EACH ROW EXECUTE FUNCTION no_room()"
-                )
-                name = f"full_{table}_{event}"
-                connection.execute(
-                    sa.text(f"CREATE TRIGGER {name} BEFORE {event} ON {table} {does}")
-                )
-
-    store.database.write(work)
+    database = store.database
+    does = "BEGIN SELECT RAISE(ABORT, 'full'); END"
+    if not database.is_sqlite:
+        does = "FOR EACH ROW EXECUTE FUNCTION no_room()"
+        execute(
+            database,
+            "CREATE FUNCTION no_room() RETURNS trigger LANGUAGE plpgsql AS "
+            "$$ BEGIN RAISE EXCEPTION USING ERRCODE = '53100'; END $$",
+        )
+    for table, event in product(tables, EVENTS):
+        execute(database, f"CREATE TRIGGER full_{table}_{event} BEFORE {event} ON {table} {does}")
 
 
 def take_writes(store: TemplateStore, *tables: str) -> None:
-    def work(connection: sa.Connection) -> None:
-        for table in tables:
-            for event in ("INSERT", "UPDATE"):
-                on = "" if connection.dialect.name == "sqlite" else f" ON {table}"
-                connection.execute(sa.text(f"DROP TRIGGER full_{table}_{event}{on}"))
-
-    store.database.write(work)
+    for table, event in product(tables, EVENTS):
+        on = "" if store.database.is_sqlite else f" ON {table}"
+        execute(store.database, f"DROP TRIGGER full_{table}_{event}{on}")
 
 
 def test_after_a_failed_write_a_write_must_succeed(both: tuple[Client, Deployment]) -> None:
@@ -63,7 +50,7 @@ def test_after_a_failed_write_a_write_must_succeed(both: tuple[Client, Deploymen
     store = client.app.state.runtime.store
     enroll = {"path": "/v1/subjects/a/enrollment", "files": images(photo(1))}
     assert client.get(READY).status_code == 200
-    tables = ("templates", "secrets")
+    tables = ("subjects", "secrets")
     refuse_writes(store, *tables)
     # Nobody has tried to write yet: a database that answers is taken for one that works.
     assert client.get(READY).status_code == 200

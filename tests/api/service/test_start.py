@@ -10,7 +10,6 @@ import anyio
 import numpy as np
 import onnx
 import pytest
-from sqlalchemy.engine import Connection
 
 from api.http.app import create_app
 from api.http.errors import StartError
@@ -47,6 +46,7 @@ from tests.api.deployment import (
     write_pack,
 )
 from tests.api.shapes import assert_answer, assert_error
+from tests.databases import execute
 
 
 @pytest.fixture
@@ -169,11 +169,7 @@ def test_a_wrong_database_is_one_sentence_without_the_password(
 def test_another_applications_rows_do_not_count(tmp_path: Path, database_url: str) -> None:
     database = Database(database_url)
 
-    def another_application(connection: Connection) -> None:
-        connection.exec_driver_sql("CREATE TABLE orders (id integer)")
-        connection.exec_driver_sql("INSERT INTO orders VALUES (1)")
-
-    database.write(another_application)
+    execute(database, "CREATE TABLE orders (id integer)", "INSERT INTO orders VALUES (1)")
     settings = Settings(data_dir=tmp_path / "data", database_url=database_url)
     assert not database_in_use(database_url)
     store = open_store(settings, open_keyring(settings))

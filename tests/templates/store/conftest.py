@@ -12,10 +12,11 @@ import sqlalchemy as sa
 
 from templates.keys.sealing import MasterKeyring
 from templates.store import Source, StoredTemplate, TemplateStore
-from templates.store.envelope import Envelope, close_envelope
+from templates.store.envelope import seal_template
 from templates.store.schema import Base
 from tests.databases import (  # noqa: F401
     database_url,
+    execute,
     migrate_ahead,
     postgres_database,
     postgres_url,
@@ -71,23 +72,27 @@ def template_id(store: TemplateStore, subject_id: str, tenant: str = "default") 
     return None if record is None else record.template_id
 
 
+def wire_of(store: TemplateStore, subject_id: str, *, tenant: str = "default") -> bytes | None:
+    found = store.subjects.get(tenant, subject_id)
+    return None if found is None else found.wire
+
+
 class SlowSealing:
     """Holds every enrollment of this process after it sealed its template, before it commits."""
 
     def __init__(self) -> None:
         self.sealed, self.go_on = threading.Event(), threading.Event()
 
-    def close_envelope(self, *arguments: Any) -> Envelope:
-        envelope = close_envelope(*arguments)
+    def seal_template(self, *arguments: Any) -> None:
+        seal_template(*arguments)
         self.sealed.set()
         assert self.go_on.wait(PATIENCE_S)
-        return envelope
 
 
 @pytest.fixture
 def slow_sealing(monkeypatch: pytest.MonkeyPatch) -> SlowSealing:
     slow = SlowSealing()
-    monkeypatch.setattr("templates.store.subjects.close_envelope", slow.close_envelope)
+    monkeypatch.setattr("templates.store.subjects.seal_template", slow.seal_template)
     return slow
 
 
@@ -98,7 +103,7 @@ def compact_until(store: TemplateStore, condition: Callable[[], bool]) -> None:
     """
 
     def compacted() -> bool:
-        store.compact()
+        store.database.compact()
         return condition()
 
     wait_until(compacted, what="tables without dead rows")
@@ -131,7 +136,7 @@ def put(
 def count(store: TemplateStore, table: type[Base]) -> int:
     """Rows of a table."""
     query = sa.select(sa.func.count()).select_from(table)
-    return int(store.database.read(lambda each: each.execute(query).scalar_one()))
+    return int(execute(store.database, query)[0][0])
 
 
 def pieces(blob: bytes) -> list[bytes]:

@@ -11,6 +11,7 @@ from templates.keys.sealing import MasterKeyring
 from templates.store import Right, TemplateStore, UnknownTenant
 from templates.store.database import Database
 from templates.store.schema import ApiKeyRow
+from tests.databases import execute
 from tests.templates.store.conftest import Clock
 from tests.templates.store.test_database import with_options
 
@@ -32,7 +33,7 @@ def test_the_token_is_not_stored_and_does_not_show(store: TemplateStore, databas
     secret = new.token.split("_")[2]
     assert secret not in repr(new)
     database = Database(database_url)
-    row = database.read(lambda each: each.execute(sa.select(ApiKeyRow)).one())
+    (row,) = execute(database, sa.select(ApiKeyRow.__table__))
     assert row.token_hash == hashlib.sha256(new.token.encode()).digest()
     for value in row:
         stored = value if isinstance(value, bytes) else str(value).encode()

@@ -2,7 +2,6 @@ import contextlib
 import socket
 import sqlite3
 import stat
-import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -18,7 +17,7 @@ from templates.store import TemplateStore
 from templates.store.database import Database
 from templates.store.schema import TenantRow
 from templates.store.turn import next_in_line
-from tests.databases import empty_database
+from tests.databases import empty_database, execute
 from tests.patience import PATIENCE_S
 from tests.templates.store.conftest import put
 
@@ -49,19 +48,16 @@ def test_all_spellings_of_postgresql_mean_psycopg(driver: str) -> None:
 def test_sqlite_is_private_durable_and_forgets(tmp_path: Path) -> None:
     path = tmp_path / "veilface.db"
     database = Database(f"sqlite:///{path}")
-
-    def pragmas(connection: sa.Connection) -> dict[str, object]:
-        names = ("journal_mode", "synchronous", "foreign_keys", "secure_delete", "temp_store")
-        return {n: connection.exec_driver_sql(f"PRAGMA {n}").scalar() for n in names}
-
-    assert database.read(pragmas) == {
+    pragmas = {
         "journal_mode": "wal",
         "synchronous": 2,  # FULL
         "foreign_keys": 1,
         "secure_delete": 1,
         "temp_store": 2,  # MEMORY
     }
-    database.write(lambda each: each.exec_driver_sql("CREATE TABLE t (x)"))
+    for name, value in pragmas.items():
+        assert execute(database, f"PRAGMA {name}") == [(value,)], name
+    execute(database, "CREATE TABLE t (x)")
     for file in tmp_path.iterdir():
         assert stat.S_IMODE(file.stat().st_mode) == 0o600, file
     database.close()
@@ -70,12 +66,9 @@ def test_sqlite_is_private_durable_and_forgets(tmp_path: Path) -> None:
 def test_a_failed_write_leaves_nothing(store: TemplateStore, database_url: str) -> None:
     database = Database(database_url)
 
-    def work(connection: sa.Connection) -> None:
-        connection.execute(sa.delete(TenantRow))
-        raise RuntimeError("half way")
-
-    with pytest.raises(RuntimeError, match="half way"):
-        database.write(work)
+    with contextlib.suppress(RuntimeError), database.write() as session:
+        session.execute(sa.delete(TenantRow))
+        raise RuntimeError
     assert [tenant.name for tenant in store.tenants.all()] == ["default", "other"]
     database.close()
 
@@ -84,15 +77,11 @@ def test_errors_never_quote_a_row(store: TemplateStore, database_url: str) -> No
     database = Database(database_url)
     tenant = store.tenants.get("default")
 
-    def twice(connection: sa.Connection) -> None:
-        connection.execute(
-            sa.insert(TenantRow).values(
-                id=tenant.id, name="secret-name", rotation_epoch=1, created_at=tenant.created_at
-            )
-        )
-
+    again = sa.insert(TenantRow).values(
+        id=tenant.id, name="secret-name", rotation_epoch=1, created_at=tenant.created_at
+    )
     with pytest.raises(StoreError) as caught:
-        database.write(twice)
+        execute(database, again)
     assert not isinstance(caught.value, StoreUnavailable)
     for part in ("secret-name", tenant.id, "INSERT"):
         assert part not in str(caught.value)
@@ -105,9 +94,9 @@ def test_no_server_is_store_unavailable() -> None:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     database = Database(f"postgresql://postgres@127.0.0.1:{port}/postgres", timeout=2)
-    for call in (database.read, database.write):
-        with pytest.raises(StoreUnavailable, match="does not answer"):
-            call(lambda connection: connection.execute(sa.select(1)))
+    for use in (database.read, database.write):
+        with pytest.raises(StoreUnavailable, match="does not answer"), use() as session:
+            session.execute(sa.select(1))
 
 
 def test_a_database_of_a_server_without_a_locale_is_used(keyring: MasterKeyring) -> None:
@@ -143,13 +132,9 @@ def test_a_connection_lost_inside_a_write_is_store_unavailable(
     store.upgrade()
     database = Database(postgres_url)
 
-    def cut(connection: sa.Connection) -> None:
-        connection.execute(sa.delete(TenantRow))
-        connection.exec_driver_sql("SELECT pg_terminate_backend(pg_backend_pid())")
-
     store.tenants.create("kept")
     with pytest.raises(StoreUnavailable, match="does not answer"):
-        database.write(cut)
+        execute(database, sa.delete(TenantRow), "SELECT pg_terminate_backend(pg_backend_pid())")
     assert [tenant.name for tenant in store.tenants.all()] == ["kept"]
     database.close()
     store.close()
@@ -164,11 +149,10 @@ def test_the_server_gives_up_a_host_that_is_cut_off_or_stopped(
     postgres_url: str, postgres_database: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def settings(url: str) -> dict[str, str]:
-        query = sa.text("SELECT name, reset_val FROM pg_settings")
         database = Database(url)
-        seen = database.read(lambda each: dict(each.execute(query).all()))
+        seen = execute(database, "SELECT name, reset_val FROM pg_settings")
         database.close()
-        return seen
+        return dict(seen)
 
     bounds = {
         "tcp_keepalives_idle": "5",
@@ -192,7 +176,7 @@ def test_a_busy_sqlite_file_is_store_unavailable(tmp_path: Path, keyring: Master
     holder.execute("BEGIN IMMEDIATE")
     with pytest.raises(StoreUnavailable, match="locked"):
         store.tenants.create("default")
-    assert store.tenants.all() == ()  # readers are not held up
+    assert store.tenants.all() == []  # readers are not held up
     holder.execute("ROLLBACK")
     holder.close()
     store.tenants.create("default")
@@ -205,12 +189,9 @@ def test_a_write_waits_for_its_turn_in_the_process_no_longer_than_the_timeout(
     store = TemplateStore(f"sqlite:///{tmp_path / 'veilface.db'}", keyring, timeout=0.2)
     store.upgrade()
 
-    def hang(_: sa.Connection) -> None:
-        with ThreadPoolExecutor(1) as other:
-            refused = other.submit(store.tenants.create, "default").exception(PATIENCE_S)
+    with store.database.write(), ThreadPoolExecutor(1) as other:
+        refused = other.submit(store.tenants.create, "default").exception(PATIENCE_S)
         assert isinstance(refused, StoreUnavailable)
-
-    store.database.write(hang)
     store.tenants.create("default")
     store.close()
 
@@ -245,13 +226,10 @@ def test_a_write_waits_for_one_that_hangs_no_longer_than_the_timeout(
     store.tenants.create("default")
     put(store, "ada", b"wire")
     database = Database(postgres_url)
-
-    def hang(connection: sa.Connection) -> None:
+    with database.write():
         with pytest.raises(StoreBusy, match="too long"):
             put(store, "ada", b"other")
         assert store.subjects.get("default", "ada") is not None
-
-    database.write(hang)
     put(store, "ada", b"other")
     database.close()
     store.close()
@@ -281,12 +259,8 @@ def test_a_full_disk_is_said_and_harms_nothing(tmp_path: Path, keyring: MasterKe
     store.upgrade()
     store.tenants.create("default")
     put(store, "first", b"1" * 5000)
-    pages = store.database.read(lambda each: each.exec_driver_sql("PRAGMA page_count").scalar())
-
-    def limit(connection: sa.Connection) -> None:
-        connection.exec_driver_sql(f"PRAGMA max_page_count = {pages}")
-
-    store.database.read(limit)
+    ((pages,),) = execute(store.database, "PRAGMA page_count")
+    execute(store.database, f"PRAGMA max_page_count = {pages}")
     with pytest.raises(StoreUnavailable, match="full"):
         put(store, "second", b"2" * 500_000)
     assert store.subjects.get("default", "second") is None
@@ -310,19 +284,8 @@ def test_a_file_that_is_no_database_is_said(tmp_path: Path, keyring: MasterKeyri
 
 def test_all_connections_busy_is_store_unavailable(database_url: str) -> None:
     database = Database(database_url, pool_size=1, max_overflow=0, timeout=0.2)
-    entered, leave = threading.Event(), threading.Event()
-
-    def hold(connection: sa.Connection) -> None:
-        entered.set()
-        leave.wait(PATIENCE_S)
-
-    thread = threading.Thread(target=lambda: database.read(hold))
-    thread.start()
-    assert entered.wait(PATIENCE_S)
-    try:
-        with pytest.raises(StoreUnavailable, match="busy"):
-            database.read(lambda connection: connection.execute(sa.select(1)))
-    finally:
-        leave.set()
-        thread.join()
-        database.close()
+    with database.read() as session:
+        session.execute(sa.select(1))
+        with pytest.raises(StoreUnavailable, match="busy"), database.read() as refused:
+            refused.execute(sa.select(1))
+    database.close()

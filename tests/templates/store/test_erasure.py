@@ -16,9 +16,9 @@ from templates.store.schema import (
     FailedAttemptsRow,
     RotationKeyRow,
     SubjectRow,
-    TemplateRow,
     TenantRow,
 )
+from tests.databases import execute
 from tests.patience import PATIENCE_S
 from tests.templates.store.conftest import (
     CONTRACT,
@@ -29,22 +29,15 @@ from tests.templates.store.conftest import (
     pieces,
     put,
 )
+from tests.templates.store.test_attempts import attempt
 
 
 def test_everything_about_the_subject_goes_at_once(
-    store: TemplateStore, database_url: str, clock: Clock
+    store: TemplateStore,
 ) -> None:
-    database = Database(database_url)
     for name in ("ada", "eve"):
         put(store, name, b"wire")
-        failed = sa.insert(FailedAttemptsRow).values(
-            tenant_id=store.tenants.get("default").id,
-            pseudonym=store.signer.pseudonym("default", name),
-            consecutive=1,
-            total=2,
-            last_failed_at=clock.time,
-        )
-        database.write(lambda each, failed=failed: each.execute(failed))
+        attempt(store, name)
 
     erasure = store.erasures.erase("default", "ada")
 
@@ -53,7 +46,7 @@ def test_everything_about_the_subject_goes_at_once(
     assert erasure.receipt.held
     assert store.subjects.get("default", "ada") is None
     assert store.subjects.describe("default", "ada") is None
-    for table in (SubjectRow, TemplateRow, FailedAttemptsRow):
+    for table in (SubjectRow, FailedAttemptsRow):
         assert count(store, table) == 1, table  # eve's
     assert store.subjects.get("default", "eve") is not None
     claims = verify_receipt(erasure.receipt, store.signer.public_key())
@@ -64,7 +57,6 @@ def test_everything_about_the_subject_goes_at_once(
         {"item": "metadata", "count": 1},
         {"item": "failed_attempts", "count": 1},
     ]
-    database.close()
 
 
 def test_an_erasure_of_each_enrollment_has_one_receipt(store: TemplateStore, clock: Clock) -> None:
@@ -179,15 +171,14 @@ def test_sqlite_files_keep_nothing_of_what_was_removed(
     clock.pass_by(days=10)
     put(store, "survivor", generator.randbytes(17_000), tenant="other")
 
-    def blobs(connection: sa.Connection) -> list[bytes]:
-        subject = sa.select(SubjectRow.wrapped_key, TemplateRow.ciphertext).join(TemplateRow)
-        row = connection.execute(subject.where(SubjectRow.subject_id == GONE)).one()
+    of_subject = sa.select(SubjectRow.wrapped_key, SubjectRow.ciphertext)
+    (blobs,) = execute(store.database, of_subject.where(SubjectRow.subject_id == GONE))
+    if action == "tenant":
         tenant = sa.select(TenantRow.id).where(TenantRow.name == "default").scalar_subquery()
         key = sa.select(RotationKeyRow.wrapped_key).where(RotationKeyRow.tenant_id == tenant)
-        return [*row, *(connection.execute(key).scalars() if action == "tenant" else ())]
-
+        blobs = (*blobs, *execute(store.database, key)[0])
     # The first bytes of a sealed blob name its master key, which others share.
-    wanted = [piece for blob in store.database.read(blobs) for piece in pieces(blob[9:])]
+    wanted = [piece for blob in blobs for piece in pieces(blob[9:])]
     wanted += [] if action == "replace" else [GONE.encode()]
     wanted += [label.encode()] if action == "tenant" else []
     # The control: before the removal they are all there.
@@ -209,16 +200,10 @@ def test_a_long_reader_delays_the_purge_and_is_reported(
     put(store, "ada", b"wire" * 1000)
     database = Database(url)
 
-    def read_while_erasing(connection: sa.Connection) -> None:
-        assert connection.execute(sa.select(SubjectRow.id)).all()
+    with database.read() as session:
+        assert session.scalars(sa.select(SubjectRow.id)).all()
         assert not store.erasures.erase("default", "ada").log_purged
-        timeout = sa.text("PRAGMA busy_timeout")
-        assert (
-            store.database.read(lambda each: each.execute(timeout).scalar_one())
-            == 1_000 * PATIENCE_S
-        )
-
-    database.read(read_while_erasing)
+        assert execute(store.database, "PRAGMA busy_timeout") == [(1_000 * PATIENCE_S,)]
     assert store.subjects.get("default", "ada") is None
     assert store.purge()
     assert (tmp_path / "veilface.db-wal").stat().st_size == 0
@@ -235,10 +220,9 @@ def test_postgresql_keeps_no_row_after_compacting(
     store.tenants.create("default")
     put(store, "ada", random.Random(4).randbytes(300))
     database = Database(postgres_url)
-    size = sa.text("SELECT pg_relation_size('templates') + pg_relation_size('subjects')")
 
     def relation_size() -> int:
-        return database.read(lambda each: each.execute(size).scalar_one())
+        return int(execute(database, "SELECT pg_relation_size('subjects')")[0][0])
 
     store.erasures.erase("default", "ada")
     assert relation_size() > 0

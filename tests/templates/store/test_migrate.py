@@ -11,6 +11,7 @@ from templates.store import TemplateStore, migrate
 from templates.store.database import Database
 from templates.store.schema import Base
 from templates.store.secrets import SecretName
+from tests.databases import execute
 from tests.templates.store.conftest import put
 
 
@@ -47,7 +48,7 @@ def test_workers_that_start_at_once_agree(database_url: str, keyring: MasterKeyr
         try:
             store.upgrade()
             tenants.append(store.tenants.create("default").id)
-            assert store.audit_log.verify().intact
+            assert store.verify_audit_log().intact
             secrets.append(store.secrets.get(SecretName.PSEUDONYM))
         except Exception as error:
             errors.append(error)
@@ -73,7 +74,7 @@ def test_check_names_the_remedy(database_url: str, keyring: MasterKeyring) -> No
     store.upgrade()
     store.check()
     database = Database(database_url)
-    database.write(lambda each: each.exec_driver_sql("UPDATE alembic_version SET version_num='9'"))
+    execute(database, "UPDATE alembic_version SET version_num='9'")
     for call in (store.check, store.upgrade):
         with pytest.raises(StoreError, match="another version migrated it"):
             call()

@@ -8,9 +8,9 @@ from templates.errors import StoreError
 from templates.keys.sealing import MasterKeyring
 from templates.store import BrokenAuditLog, By, TemplateStore, verify_archive, verify_receipt
 from templates.store.secrets import SecretName
+from tests.databases import execute
 from tests.templates.store.conftest import Clock, put
 from tests.templates.store.test_attempts import attempt
-from tests.templates.store.test_written_database import write
 
 
 def renew(store: TemplateStore, tmp_path: Path) -> Path:
@@ -47,7 +47,7 @@ def test_the_old_log_goes_into_an_archive_under_the_old_key(
     with pytest.raises(StoreError):
         verify_archive(archive, store.signer.public_key())
     assert [line.action for line in store.audit_log.lines()] == ["secrets-renew"]
-    assert store.audit_log.verify(anchor=head).intact
+    assert store.verify_audit_log(anchor=head).intact
 
 
 def test_who_has_the_old_secrets_writes_no_line_and_makes_no_key(
@@ -73,7 +73,9 @@ def test_a_key_that_was_made_up_before_is_not_vouched_for(
     store: TemplateStore, tmp_path: Path
 ) -> None:
     good, bad = (store.api_keys.create("default", ["verify"]) for _ in range(2))
-    write(store, f"UPDATE api_keys SET rights = 'admin' WHERE prefix = '{bad.key.prefix}'")
+    execute(
+        store.database, f"UPDATE api_keys SET rights = 'admin' WHERE prefix = '{bad.key.prefix}'"
+    )
     renewed = store.renew_secrets(tmp_path / "before.jsonl")
     assert renewed.refused == (bad.key.prefix,)
     assert store.api_keys.verify(good.token) is not None
@@ -88,7 +90,10 @@ def test_receipts_are_signed_again_where_they_were_good(
         store.erasures.erase("default", name)
     before = store.erasures.receipt("default", "ada")
     assert before is not None
-    write(store, "UPDATE receipts SET body = replace(body, 'erased', 'ERASED') WHERE sequence = 2")
+    execute(
+        store.database,
+        "UPDATE receipts SET body = replace(body, 'erased', 'ERASED') WHERE sequence = 2",
+    )
     renewed = store.renew_secrets(tmp_path / "before.jsonl")
     assert renewed.receipts == 1
     ada, eve = (store.erasures.receipt("default", name) for name in ("ada", "eve"))
@@ -114,7 +119,7 @@ def test_counts_and_templates_go_on(store: TemplateStore, tmp_path: Path) -> Non
 def test_a_log_that_is_not_whole_is_looked_at_first(store: TemplateStore, tmp_path: Path) -> None:
     put(store, "ada", b"wire")
     before = secrets_of(store)
-    write(store, "UPDATE audit_log SET actor = 'program2'")
+    execute(store.database, "UPDATE audit_log SET actor = 'program2'")
     with pytest.raises(BrokenAuditLog):
         renew(store, tmp_path)
     assert secrets_of(store) == before

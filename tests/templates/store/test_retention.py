@@ -91,7 +91,7 @@ def test_it_is_the_ordinary_erasure(store: TemplateStore, clock: Clock) -> None:
     assert {line.pseudonym for line in lines} == {
         store.signer.pseudonym(tenant, "ada") for tenant in ("default", "other")
     }
-    assert store.audit_log.verify().intact
+    assert store.verify_audit_log().intact
 
 
 @pytest.mark.parametrize("value", [timedelta(0), -DAY, 36_501 * DAY, timedelta.max])

@@ -9,7 +9,8 @@ from templates.keys.sealing import MasterKeyring
 from templates.store import TemplateStore
 from templates.store.database import Database
 from templates.store.rewrap import WRAPPED
-from templates.store.schema import Base, TemplateRow
+from templates.store.schema import Base, SubjectRow
+from tests.databases import execute
 from tests.patience import PATIENCE_S
 from tests.templates.store.conftest import SlowSealing, put
 
@@ -58,9 +59,7 @@ def test_a_rotation_leaves_nothing_under_the_old_key(
 
 def ciphertexts(database_url: str) -> set[bytes]:
     database = Database(database_url)
-    found = database.read(
-        lambda each: set(each.execute(sa.select(TemplateRow.ciphertext)).scalars())
-    )
+    found = {row.ciphertext for row in execute(database, sa.select(SubjectRow.ciphertext))}
     database.close()
     return found
 
@@ -143,6 +142,6 @@ def test_every_wrapped_column_of_the_schema_is_known() -> None:
         for column in table.columns
         if column.name.startswith("wrapped_")
     }
-    known = {(each.table.__tablename__, each.blob) for each in WRAPPED}
+    known = {(each.table.__tablename__, "wrapped_key") for each in WRAPPED}
     assert known == wrapped
     assert len(WRAPPED) == 3

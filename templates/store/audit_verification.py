@@ -1,4 +1,4 @@
-"""What a database writer put back: rows that the audit log tells to have ended.
+"""Verifying the audit log, and holding the rows of other tables against it.
 
 An attacker who can write the database, but has no master key, can put back a row as it once was.
 It is a true row, so the service takes it. The log, which tells that it ended, is what shows it.
@@ -10,15 +10,22 @@ from datetime import datetime, timedelta
 from typing import Any
 
 import sqlalchemy as sa
-from sqlalchemy.engine import Connection
+from sqlalchemy.orm import Session
 
 from templates.errors import StoreError
 from templates.store.api_keys import ApiKeys
 from templates.store.attempts import COUNT_RETENTION
-from templates.store.audit_chain import Anchor
-from templates.store.audit_log import TENANT_ERASE, Verification, template_digest
+from templates.store.audit_chain import (
+    START,
+    Anchor,
+    BrokenAuditLog,
+    ChainBreak,
+    Head,
+    good_lines,
+)
+from templates.store.audit_log import TENANT_ERASE, template_digest
 from templates.store.context import StoreContext
-from templates.store.schema import FailedAttemptsRow, SubjectRow, TemplateRow, TenantRow
+from templates.store.schema import FailedAttemptsRow, SubjectRow, TenantRow
 
 KEY_ALTERED = "the row of an API key was made up or altered"
 KEY_PUT_BACK = "an API key that was revoked was put back"
@@ -42,6 +49,24 @@ class RecordProblem:
 
     what: str
     about: str
+
+
+@dataclass(frozen=True)
+class Verification:
+    """What a walk over the whole chain showed: good lines, the last of them, the first break.
+
+    Where there is none, `records` are the rows that contradict the log.
+    """
+
+    lines: int
+    head: Anchor
+    problem: ChainBreak | None
+    records: tuple[RecordProblem, ...] = ()
+
+    @property
+    def intact(self) -> bool:
+        """Whether nothing is wrong."""
+        return self.problem is None and not self.records
 
 
 @dataclass
@@ -94,40 +119,46 @@ class LogFindings:
         failures.last_at = at
 
 
-def verify_log_and_records(
+def verify_audit_log(
     context: StoreContext,
     api_keys: ApiKeys,
     *,
     anchor: Anchor | None = None,
     progress: Callable[[int], None] | None = None,
-) -> tuple[Verification, tuple[RecordProblem, ...]]:
+) -> Verification:
     """Walk over the audit log, and hold rows of the same moment against what it tells.
 
-    Rows are looked at only where the log is whole. What lines in an archive tell is not known.
+    It runs beside a service in use. `progress` is called with the number of further lines. Without
+    an `anchor`, an earlier head, an old state of the whole log is not told from a new one. What
+    lines in an archive tell is not known.
     """
-    findings, key = LogFindings(), context.audit_log.key
-
-    def work(connection: Connection) -> tuple[Verification, tuple[RecordProblem, ...]]:
-        verification = context.audit_log.walk(
-            connection, key, anchor=anchor, seen=findings.read, progress=progress
+    findings, key, lines, last = LogFindings(), context.audit_log.key, 0, START
+    with context.database.snapshot() as session:
+        try:
+            head = Head.read(session, key)
+            last, is_anchored = head.base, anchor in (None, head.base)
+            for line in good_lines(session, key, head, progress=progress):
+                findings.read(line)
+                last, lines = Anchor(line["sequence"], line["mac"]), lines + 1
+                is_anchored |= last == anchor
+            if anchor is not None and not is_anchored:
+                raise ChainBreak(anchor.sequence, "anchor not in chain")
+        except BrokenAuditLog:
+            return Verification(lines, last, ChainBreak(0, "head does not match"))
+        except ChainBreak as problem:
+            return Verification(lines, last, problem)
+        records = (
+            *_keys(findings, api_keys, session),
+            *_tenants(findings, session),
+            *_enrollments(findings, context, session),
+            *_counts(findings, context, session),
         )
-        if not verification.intact:
-            return verification, ()
-        return verification, (
-            *_keys(findings, api_keys, connection),
-            *_tenants(findings, connection),
-            *_enrollments(findings, context, connection),
-            *_counts(findings, context, connection),
-        )
-
-    return context.database.snapshot(work)
+        return Verification(lines, last, None, records)
 
 
-def _keys(
-    findings: LogFindings, api_keys: ApiKeys, connection: Connection
-) -> Iterator[RecordProblem]:
+def _keys(findings: LogFindings, api_keys: ApiKeys, session: Session) -> Iterator[RecordProblem]:
     try:
-        keys = api_keys.read_all(connection)
+        keys = api_keys.read_all(session)
     except StoreError:
         yield RecordProblem(KEY_ALTERED, "a row that cannot be read")
         return
@@ -138,9 +169,9 @@ def _keys(
             yield RecordProblem(KEY_PUT_BACK, f"key:{key.prefix}")
 
 
-def _tenants(findings: LogFindings, connection: Connection) -> Iterator[RecordProblem]:
+def _tenants(findings: LogFindings, session: Session) -> Iterator[RecordProblem]:
     columns = TenantRow.id, TenantRow.name, TenantRow.template_enrollment
-    for tenant_id, name, template_enrollment in connection.execute(sa.select(*columns)):
+    for tenant_id, name, template_enrollment in session.execute(sa.select(*columns)):
         if tenant_id in findings.erased_tenants:
             yield RecordProblem(TENANT_PUT_BACK, name)
         elif findings.settings.get(name, template_enrollment) != template_enrollment:
@@ -148,14 +179,12 @@ def _tenants(findings: LogFindings, connection: Connection) -> Iterator[RecordPr
 
 
 def _enrollments(
-    findings: LogFindings, context: StoreContext, connection: Connection
+    findings: LogFindings, context: StoreContext, session: Session
 ) -> Iterator[RecordProblem]:
-    query = (
-        sa.select(TenantRow.name, SubjectRow.subject_id, TemplateRow.template_id)
-        .join(SubjectRow, SubjectRow.tenant_id == TenantRow.id)
-        .join(TemplateRow, TemplateRow.subject_pk == SubjectRow.id)
+    query = sa.select(TenantRow.name, SubjectRow.subject_id, SubjectRow.template_id).join(
+        SubjectRow, SubjectRow.tenant_id == TenantRow.id
     )
-    for tenant, subject_id, template_id in connection.execute(query):
+    for tenant, subject_id, template_id in session.execute(query):
         pseudonym = context.signer.pseudonym(tenant, subject_id)
         digest = template_digest(template_id)
         if findings.templates.get(pseudonym, digest) != digest:
@@ -163,10 +192,9 @@ def _enrollments(
 
 
 def _counts(
-    findings: LogFindings, context: StoreContext, connection: Connection
+    findings: LogFindings, context: StoreContext, session: Session
 ) -> Iterator[RecordProblem]:
-    rows = connection.execute(sa.select(FailedAttemptsRow.__table__))
-    stored = {row.pseudonym: row for row in rows}
+    stored = {row.pseudonym: row for row in session.scalars(sa.select(FailedAttemptsRow))}
     for pseudonym, failures in findings.failures.items():
         row = stored.get(pseudonym)
         # The row counts what the log tells, and its last failure is the log's.
