@@ -30,7 +30,7 @@ from PIL import Image
 
 from templates.contract.wire import decode, encode
 from templates.decoys import client_source
-from templates.keys.rotation import SignedCosineRotation, TenantRotation
+from templates.keys.rotation import Rotation, TenantRotation
 from templates.keys.sealing import MasterKeyring
 from templates.space.lifting import Strategy, lift
 from templates.store import TemplateStore
@@ -79,7 +79,7 @@ class OpenedTemplate:
     """The arrays of a decrypted template as they are on the wire: foot point, then basis."""
 
     rows: NDArray[np.float64] = field(repr=False)
-    rotation: SignedCosineRotation = field(repr=False)
+    rotation: Rotation = field(repr=False)
 
 
 @dataclass(repr=False)

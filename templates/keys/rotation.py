@@ -9,7 +9,6 @@ can be renewed, or undone for an export, without the holder's key.
 """
 
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 from cryptography.hazmat.primitives.hashes import SHA256
@@ -19,13 +18,13 @@ from numpy.typing import NDArray
 from templates.keys.randomness import KEY_BYTES
 from templates.keys.sealing import encode_parts
 
-ROTATION_VERSION = "signs-cosine-2"
+ROTATION_VERSION = "signs-hartley-1"
 """Names how a key and a template's id become a rotation; part of the contract."""
-HOLDER_VERSION = "signs-cosine-2"
+HOLDER_VERSION = "signs-hartley-1"
 """Names how a holder's key and the salt of an enrollment become a rotation."""
 TRANSFORMS = 4
-"""Cosine transforms of one rotation. After k of them the variance of any entry of R x over the keys
-is 1/n for every unit vector x, to a relative n^(1 − k/2): with four, 1/n (docs/method.md §4.9)."""
+"""Transforms of one rotation. With four, the variance of any entry of R x over the keys is 1/n for
+every unit vector x, to a relative 1/n (docs/method.md §4.9)."""
 
 Array64 = NDArray[np.float64]
 HolderKey = bytes | bytearray
@@ -33,8 +32,8 @@ HolderKey = bytes | bytearray
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class SignedCosineRotation:
-    """Random signs and orthonormal cosine transforms in turn, with signs at both ends.
+class Rotation:
+    """Random signs and orthonormal Hartley transforms in turn, with signs at both ends.
 
     Parameters
     ----------
@@ -48,51 +47,23 @@ class SignedCosineRotation:
         """Return R x for every row."""
         turned = points * self.signs[0]
         for signs in self.signs[1:]:
-            turned = _cosines(turned)
-            turned *= signs
+            turned = _hartley(turned) * signs
         return np.asarray(turned)
 
     def turned_back(self, points: NDArray[np.floating]) -> Array64:
         """Return Rᵀ x for every row."""
-        turned = points * self.signs[-1]
-        for signs in self.signs[-2::-1]:
-            turned = _cosines_back(turned)
-            turned *= signs
-        return np.asarray(turned)
+        return Rotation(self.signs[::-1]).turned(points)
 
 
-@cache
-def _phases(n: int) -> tuple[Array64, NDArray[np.complex128]]:
-    """Norms of the n cosines, and the factors between their transform and Fourier's."""
-    norms = np.full(n, np.sqrt(2 / n))
-    norms[0] = np.sqrt(1 / n)
-    return norms, np.exp(-0.5j * np.pi * np.arange(n) / n)
-
-
-def _cosines(rows: Array64) -> Array64:
-    """Orthonormal cosine transform (DCT-II) of every row, by the Fourier transform of a reordering.
+def _hartley(rows: Array64) -> Array64:
+    """Orthonormal Hartley transform of every row, which undoes itself.
 
     References
     ----------
-    J. Makhoul, "A fast cosine transform in one and two dimensions", IEEE Trans. ASSP 28(1), 1980.
+    R. N. Bracewell, "Discrete Hartley transform", JOSA 73(12), 1983.
     """
-    norms, phases = _phases(rows.shape[-1])
-    folded = np.concatenate([rows[..., ::2], rows[..., 1::2][..., ::-1]], axis=-1)
-    return np.asarray((np.fft.fft(folded) * phases).real * norms)
-
-
-def _cosines_back(rows: Array64) -> Array64:
-    """Undo :func:`_cosines`."""
-    n = rows.shape[-1]
-    norms, phases = _phases(n)
-    real = rows / norms
-    imaginary = np.zeros_like(real)
-    imaginary[..., 1:] = real[..., :0:-1]
-    folded = np.fft.ifft((real - 1j * imaginary) / phases).real
-    unfolded = np.empty_like(real)
-    unfolded[..., ::2] = folded[..., : (n + 1) // 2]
-    unfolded[..., 1::2] = folded[..., : (n - 1) // 2 : -1] if n > 1 else folded[..., :0]
-    return unfolded
+    spectrum = np.fft.fft(rows, norm="ortho")
+    return np.asarray(spectrum.real - spectrum.imag)
 
 
 class TenantRotation:
@@ -112,7 +83,7 @@ class TenantRotation:
     def __repr__(self) -> str:
         return f"TenantRotation(n={self.n})"
 
-    def of(self, template_id: str) -> SignedCosineRotation:
+    def of(self, template_id: str) -> Rotation:
         """Return the rotation of one template, whose id is random. Equal everywhere to rounding.
 
         HKDF-SHA-256 turns the key, n and the id into the bits of all signs. The derived bits are
@@ -123,7 +94,7 @@ class TenantRotation:
         return _derived(self._key, info, self.n)
 
 
-def holder_rotation(key: HolderKey, salt: str, n: int) -> SignedCosineRotation:
+def holder_rotation(key: HolderKey, salt: str, n: int) -> Rotation:
     """Return the rotation of one enrollment under its holder's key, of n dimensions.
 
     The salt is random, and another one for each enrollment. It stays where the template gets
@@ -134,9 +105,9 @@ def holder_rotation(key: HolderKey, salt: str, n: int) -> SignedCosineRotation:
     return _derived(key, encode_parts("holder rotation", HOLDER_VERSION, n, salt), n)
 
 
-def _derived(key: HolderKey, info: bytes, n: int) -> SignedCosineRotation:
+def _derived(key: HolderKey, info: bytes, n: int) -> Rotation:
     count = (TRANSFORMS + 1) * n
     derived = HKDF(algorithm=SHA256(), length=-(-count // 8), salt=None, info=info).derive(key)
     bits = np.unpackbits(np.frombuffer(derived, dtype=np.uint8), count=count)
     signs = 1 - 2 * bits.astype(np.float64)
-    return SignedCosineRotation(signs.reshape(-1, n))
+    return Rotation(signs.reshape(-1, n))

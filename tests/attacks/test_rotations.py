@@ -6,7 +6,7 @@ from attacks.rotations import rotations_of, turned
 from attacks.stored.foot_point import foot_points
 from enroll import Enroller, Holder
 from templates.contract import wire
-from templates.keys.rotation import SignedCosineRotation, TenantRotation
+from templates.keys.rotation import Rotation, TenantRotation
 from templates.space.embedding import normalised
 from tests.attacks.beds import bed_of, population
 
@@ -45,9 +45,7 @@ def test_templates_of_ones_own_tell_no_other_rotation() -> None:
     own = rotations_of(bed, "first", "account", len(accounts))
     others = rotations_of(bed, "first", "victim", len(victims))
 
-    def found(
-        of_accounts: list[SignedCosineRotation], of_victims: list[SignedCosineRotation]
-    ) -> float:
+    def found(of_accounts: list[Rotation], of_victims: list[Rotation]) -> float:
         stolen = turned(accounts, of_accounts)
         left, _, right = np.linalg.svd(stolen.feet.T.astype(float) @ accounts.feet)
         opened = turned(victims, of_victims).feet @ (left @ right)

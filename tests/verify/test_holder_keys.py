@@ -12,7 +12,7 @@ from enroll import Enroller, Enrollment, Holder
 from templates.contract import wire
 from templates.contract.document import Contract
 from templates.distances import Metric
-from templates.keys.rotation import SignedCosineRotation, holder_rotation
+from templates.keys.rotation import Rotation, holder_rotation
 from templates.space.lifting import lift
 from templates.space.subspace import SubspaceBatch
 from tests.verify.synthetic import (
@@ -143,7 +143,7 @@ def test_a_template_that_needs_no_key_ignores_one(verifier: Verifier, enroller: 
 class CountedRotation:
     """The holder's rotation, and how many points it turned."""
 
-    def __init__(self, made: SignedCosineRotation, counts: list[int]) -> None:
+    def __init__(self, made: Rotation, counts: list[int]) -> None:
         self._made, self._counts = made, counts
 
     def turned(self, points: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -13,7 +13,7 @@ from templates.decoys import DecoyGenerator
 from templates.distances import Metric
 from templates.errors import ContractMismatch, InvalidTemplate, Uncalibrated
 from templates.keys.randomness import Keystream
-from templates.keys.rotation import SignedCosineRotation, TenantRotation
+from templates.keys.rotation import Rotation, TenantRotation
 from templates.space.agreement import InconsistentImages
 from templates.space.lifting import lift
 from templates.space.subspace import SubspaceBatch
@@ -257,7 +257,7 @@ def test_a_rotation_is_derived_and_applied_for_nobody_too(
 ) -> None:
     derive, ids, rows = TenantRotation.of, list[str](), list[tuple[int, ...]]()
 
-    def derived(self: TenantRotation, template_id: str) -> SignedCosineRotation:
+    def derived(self: TenantRotation, template_id: str) -> Rotation:
         ids.append(template_id)
         rotation = derive(self, template_id)
         turn = type(rotation).turned

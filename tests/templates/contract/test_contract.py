@@ -129,7 +129,7 @@ def test_contract_id_is_the_hash_of_the_canonical_json() -> None:
         + "ab" * 32
         + '","m":3,"n":16,'
         '"preprocessing":{"flip":false,"mean":[127.5,127.5,127.5],"size":112},'
-        '"rotation_version":"signs-cosine-2","strategy":"random"}'
+        '"rotation_version":"signs-hartley-1","strategy":"random"}'
     )
     assert make_binding().contract_id == hashlib.sha256(written.encode("utf-8")).hexdigest()
     # However the values are written.

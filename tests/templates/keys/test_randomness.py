@@ -27,28 +27,33 @@ class Fixed(Keystream):
         words, self.rest = self.rest[: nbytes // 8], self.rest[nbytes // 8 :]
         return np.array(words, dtype=np.uint64).tobytes()
 
-    def _words(self, out):
-        out[:] = np.frombuffer(self.token(out.nbytes), dtype=np.uint64)
-        return out
-
 
 def test_stream_is_chacha20():
     stream = Keystream(bytes(KEY_BYTES))
     assert stream.token(30) + stream.token(34) == RFC_8439_A1
 
 
-def test_samples_are_made_of_the_words_of_the_stream_in_order():
+def test_uniforms_are_made_of_the_words_of_the_stream_in_order():
     count = 200_000  # more than one tile
     words = np.frombuffer(Keystream.seeded("w").token(8 * count), dtype=np.uint64)
     uniform = Keystream.seeded("w").uniform((2, count // 2), -3.0, 5.0)
     np.testing.assert_allclose(uniform.ravel(), -3 + 8 * (words / 2.0**64), atol=1e-14)
-    normal = Keystream.seeded("w").normal(count)
-    np.testing.assert_allclose(normal, stats.norm.ppf(words / 2.0**64), atol=1e-9, rtol=1e-9)
+
+
+def test_normals_are_normal_and_independent():
+    normal = Keystream.seeded("w").normal((2, 100_001))  # more than one tile, and odd
+    assert stats.kstest(normal.ravel(), "norm").pvalue > 1e-3
+    assert stats.kstest(normal[0] ** 2 + normal[1] ** 2, stats.expon(scale=2).cdf).pvalue > 1e-3
+    assert abs(np.mean(normal[:, 1:] * normal[:, :-1])) < 0.01
+    # Two samples of one tile share a radius: neither they nor their squares are correlated.
+    one, other = normal.ravel()[: 1 << 15], normal.ravel()[1 << 15 : 1 << 16]
+    for power in (1, 2):
+        assert abs(np.corrcoef(one**power, other**power)[0, 1]) < 0.03
 
 
 @pytest.mark.parametrize("word", [0, 2**64 - 1])
 def test_extreme_words_give_finite_normals_and_uniforms_in_range(word: int):
-    assert 7 < abs(Fixed(word).normal(1)[0]) < 9
+    assert np.abs(Fixed(word, word).normal(2)).max() < 9
     assert 0 <= Fixed(word).uniform(1)[0] < 1
 
 

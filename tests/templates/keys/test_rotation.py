@@ -11,7 +11,7 @@ from templates.distances import Metric, pairwise_distances
 from templates.keys.randomness import Keystream
 from templates.keys.rotation import (
     TRANSFORMS,
-    SignedCosineRotation,
+    Rotation,
     TenantRotation,
     holder_rotation,
 )
@@ -34,11 +34,11 @@ def expanded(key: bytes, info: bytes, length: int) -> bytes:
     return out[:length]
 
 
-def matrix(rotation: SignedCosineRotation, n: int) -> NDArray[np.float64]:
+def matrix(rotation: Rotation, n: int) -> NDArray[np.float64]:
     return rotation.turned(np.eye(n)).T
 
 
-def rotations(count: int, n: int) -> Callable[[str], SignedCosineRotation]:
+def rotations(count: int, n: int) -> Callable[[str], Rotation]:
     """The rotation of a template id, under the first of `count` keys."""
     return TenantRotation(count.to_bytes(32), n).of
 
@@ -47,17 +47,16 @@ def rotations(count: int, n: int) -> Callable[[str], SignedCosineRotation]:
 def test_rotation_follows_from_key_and_id_as_documented(n: int) -> None:
     key, template_id = b"k" * 32, "0123456789abcdef" * 2
     count = (TRANSFORMS + 1) * n
-    info = encode_parts("template rotation", "signs-cosine-2", n, template_id)
+    info = encode_parts("template rotation", "signs-hartley-1", n, template_id)
     derived = expanded(key, info, -(-count // 8))
     bits = [byte >> (7 - place) & 1 for byte in derived for place in range(8)][:count]
     signs = np.where(np.reshape(bits, (-1, n)), -1.0, 1.0)
-    # The orthonormal DCT-II from its definition.
-    row, column = np.mgrid[:n, :n]
-    cosine = np.sqrt(2 / n) * np.cos(np.pi * row * (2 * column + 1) / (2 * n))
-    cosine[0] = n**-0.5
+    # The orthonormal Hartley transform from its definition.
+    angles = 2 * np.pi * np.outer(np.arange(n), np.arange(n)) / n
+    hartley = (np.cos(angles) + np.sin(angles)) / np.sqrt(n)
     expected = np.diag(signs[0])
     for each in signs[1:]:
-        expected = np.diag(each) @ cosine @ expected
+        expected = np.diag(each) @ hartley @ expected
     found = matrix(TenantRotation(key, n).of(template_id), n)
     np.testing.assert_allclose(found, expected, atol=1e-12)
 
@@ -120,9 +119,7 @@ def test_entries_are_those_of_a_haar_rotation(n: int) -> None:
     for one, other in ((2, 2), (0, 2), (0, 0)):
         products = moments[one][:, :-1] * moments[other][:, 1:]
         assert abs(products.mean()) < 6 / np.sqrt(products.size)
-    single = np.stack(
-        [SignedCosineRotation(signs).turned(fixed[:1])[0] for signs in _signs(keys, 2, n)]
-    )
+    single = np.stack([Rotation(signs).turned(fixed[:1])[0] for signs in _signs(keys, 2, n)])
     assert np.abs((single**2 * n).mean(axis=0) - 1).max() > 0.9
 
 
@@ -169,10 +166,10 @@ def test_a_holders_rotation_follows_from_key_and_salt_as_documented(n: int) -> N
     """That of a tenant's key and a template's id, but for the words in front."""
     key, salt = bytes(range(32)), "fedcba9876543210" * 2
     count = (TRANSFORMS + 1) * n
-    info = encode_parts("holder rotation", "signs-cosine-2", n, salt)
+    info = encode_parts("holder rotation", "signs-hartley-1", n, salt)
     derived = expanded(key, info, -(-count // 8))
     bits = np.unpackbits(np.frombuffer(derived, dtype=np.uint8), count=count)
-    expected = SignedCosineRotation(1.0 - 2.0 * bits.reshape(-1, n))
+    expected = Rotation(1.0 - 2.0 * bits.reshape(-1, n))
     found = matrix(holder_rotation(bytearray(key), salt, n), n)
     np.testing.assert_array_equal(found, matrix(expected, n))
     np.testing.assert_allclose(found @ found.T, np.eye(n), atol=1e-12)

@@ -15,7 +15,7 @@ from templates.contract import wire
 from templates.contract.binding import Binding
 from templates.errors import StoreError, StoreUnavailable
 from templates.keys.randomness import Keystream
-from templates.keys.rotation import ROTATION_VERSION, SignedCosineRotation, TenantRotation
+from templates.keys.rotation import ROTATION_VERSION, Rotation, TenantRotation
 from templates.keys.sealing import MasterKeyring
 from templates.space.lifting import Strategy, lift
 from templates.store import Attempt, Source, TemplateStore, UnknownTenant
@@ -90,9 +90,7 @@ class People:
             rotation_epoch=epoch,
         )
 
-    def rotation(
-        self, epoch: int, template_id: str, tenant: str = "default"
-    ) -> SignedCosineRotation:
+    def rotation(self, epoch: int, template_id: str, tenant: str = "default") -> Rotation:
         key = self._store.tenants.rotation_key(tenant, epoch=epoch).key
         return TenantRotation(key, N).of(template_id)
 
