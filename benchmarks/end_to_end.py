@@ -19,7 +19,7 @@ from models.cache import EmbeddingCache
 from models.extraction import Extractor
 from models.pack import ModelPack
 from models.selection import FacePolicy
-from templates.keys.sealing import KeyringSealer, MasterKeyring
+from templates.keys.sealing import MasterKeyring, Sealer
 from veilface_client import Client, PrivateClient
 from verify.datasets import labelled_folder
 from verify.trials import unit_means
@@ -54,7 +54,7 @@ def measure(args: argparse.Namespace) -> list[dict[str, object]]:
             m = client.contract().binding["m"]
         seconds = time.perf_counter() - started
         keyring = MasterKeyring.load(Path(service.env["VEILFACE_MASTER_KEY_FILE"]))
-    cache = EmbeddingCache.open_file(args.work / "cache.veil", KeyringSealer(keyring))
+    cache = EmbeddingCache.open_file(args.work / "cache.veil", Sealer(keyring))
     run = {"level": args.level, "enrolled": args.enrolled, "shown": args.burst}
     means = "lifted probes" if args.private else "photos"
     raw = raw_counts(args, people, cache)

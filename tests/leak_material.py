@@ -15,7 +15,7 @@ from models.errors import FaceError
 from models.extraction import Extractor
 from models.pack import ModelPack
 from templates.decoys import DecoyPool
-from templates.keys.sealing import KeyringSealer, MasterKeyring
+from templates.keys.sealing import MasterKeyring, Sealer
 from templates.space.lifting import Strategy
 from verify import CalibrationOptions, calibrate
 from verify.preparation import binding_for
@@ -58,7 +58,7 @@ def make_material(
     """Photos with their embeddings, a pool of real decoys and a contract of it."""
     pack = ModelPack.load(pack_dir, threads=2)
     keyring = MasterKeyring.create(folder / "master.key")
-    sealer = KeyringSealer(keyring)
+    sealer = Sealer(keyring)
     cache = EmbeddingCache.open_file(folder / "cache.veil", sealer)
     names = sorted(path.name for path in people.iterdir())
     sitters = list(islice((name for name in names if _usable(pack, people / name)), PEOPLE))

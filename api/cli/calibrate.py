@@ -198,7 +198,7 @@ def calibrate(
         {
             "out": path,
             **notice,
-            "contract": contract.public(),
+            "contract": contract.to_json(),
             "failure_to_acquire": acquired_json(extraction),
             "chosen": done.point.chosen,
             "tried": done.point.tried,

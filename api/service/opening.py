@@ -21,7 +21,7 @@ from models.pack import ModelPack
 from templates.contract.document import Contract
 from templates.decoys import DecoyGenerator, DecoyPool, load_source
 from templates.errors import SealError, VeilfaceError
-from templates.keys.sealing import KeyringSealer, MasterKeyring
+from templates.keys.sealing import MasterKeyring, Sealer
 from templates.store import TemplateStore
 from templates.store.database import Database
 from templates.store.lockout import LockoutPolicy
@@ -68,9 +68,9 @@ def open_deployment(settings: Settings, *, contract: Contract | None = None) -> 
     return Deployment(settings, keyring, open_store(settings, keyring), contract, source)
 
 
-def file_sealer(keyring: MasterKeyring) -> KeyringSealer:
+def file_sealer(keyring: MasterKeyring) -> Sealer:
     """Return what seals the files that belong to the deployment: contract, decoy pool, cache."""
-    return KeyringSealer(keyring)
+    return Sealer(keyring)
 
 
 def open_keyring(settings: Settings) -> MasterKeyring:

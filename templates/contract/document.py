@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, ClassVar
 
-from pydantic import Field
+from pydantic import Field, computed_field
 
 from templates.contract.binding import Binding
 from templates.contract.canonical import Json, digest, parse_object
@@ -29,7 +29,7 @@ from templates.contract.verdict import Verdict
 from templates.decoys import DecoySource, client_source
 from templates.distances import Metric
 from templates.errors import ContractError, SealError, Uncalibrated
-from templates.keys.private_file import read_at_most, replace_private
+from templates.keys.private_file import read_bounded, replace_private
 from templates.keys.randomness import KEY_BYTES
 from templates.keys.sealing import Sealer
 
@@ -93,9 +93,9 @@ class Contract(JsonValue):
     probe_consistency: Cosine
     template_foot_point_norm: tuple[Share, Share]
     template_stranger_similarity: float
-    cohort_seed: Annotated[bytes, Field(min_length=KEY_BYTES, max_length=KEY_BYTES)] = field(
-        repr=False
-    )
+    cohort_seed: Annotated[
+        bytes, Field(min_length=KEY_BYTES, max_length=KEY_BYTES, exclude=True)
+    ] = field(repr=False)
     verdict: Verdict | None = None
     liveness: LivenessCalibration | None = None
 
@@ -114,6 +114,7 @@ class Contract(JsonValue):
         identified = tuple(entry.identified(self.contract_id) for entry in self.calibrations)
         object.__setattr__(self, "calibrations", identified)
 
+    @computed_field  # type: ignore[prop-decorator]
     @property
     def contract_id(self) -> str:
         """SHA-256 of the binding's canonical JSON."""
@@ -184,22 +185,10 @@ class Contract(JsonValue):
         wanted = f"{mode} {metric or 'any metric'} with probe m = {probe_m}"
         raise Uncalibrated(f"no calibration for {wanted}; calibrated are: {', '.join(have)}")
 
-    def to_json(self) -> dict[str, Json]:
-        """JSON form of everything but the seed of the cohort."""
-        facts = super().to_json() | {"contract_id": self.contract_id}
-        del facts["cohort_seed"]
-        if self.liveness is None:
-            del facts["liveness"]
-        return facts
-
-    def public(self) -> dict[str, Json]:
-        """Everything but the seed of the cohort, as JSON values."""
-        return self.to_json()
-
     def save(self, path: Path | str, sealer: Sealer) -> None:
         """Write the contract file atomically, readable by its owner only (mode 0600).
 
-        ``public()`` returns the same facts for readers who may not know the seed.
+        :meth:`to_json` gives the same facts, but for the seed.
 
         Raises
         ------
@@ -207,10 +196,11 @@ class Contract(JsonValue):
             Where :meth:`load` would refuse the file.
         """
         self.from_json(self.to_json(), cohort_seed=self.cohort_seed.hex())
-        document: dict[str, Json] = {"format": FORMAT, "version": VERSION, **self.public()}
+        document: dict[str, Json] = {"format": FORMAT, "version": VERSION, **self.to_json()}
         sealed = sealer.seal(self.cohort_seed, context=_seal_context(document))
         document["sealed"] = base64.b64encode(sealed).decode("ascii")
-        replace_private(Path(path), _render(document))
+        text = json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False)
+        replace_private(Path(path), text.encode())
 
     @classmethod
     def load(cls, path: Path | str, sealer: Sealer) -> "Contract":
@@ -223,7 +213,14 @@ class Contract(JsonValue):
         SealError
             Where the sealed part does not open: another master key, or an edited file.
         """
-        document = parse_object(_read_bounded(Path(path)), what="the contract file")
+        try:
+            data = read_bounded(Path(path), MAX_FILE_BYTES)
+        except OSError as error:
+            raise ContractError(
+                f"the contract file cannot be read ({error.strerror}); `veilface calibrate` writes "
+                "one"
+            ) from None
+        document = parse_object(data, what="the contract file")
         if document.get("format") != FORMAT:
             raise ContractError(f"the file is not a {FORMAT}")
         if document.get("version") != VERSION:
@@ -255,20 +252,3 @@ def _open_sealed(text: object, sealer: Sealer, document: Mapping[str, object]) -
             "the contract does not open: the master key is not the one that sealed it, or the file "
             "was edited; use the right key file, or run the calibration again"
         ) from error
-
-
-def _read_bounded(path: Path) -> bytes:
-    try:
-        with path.open("rb") as file:
-            data = read_at_most(file, MAX_FILE_BYTES)
-    except OSError as error:
-        raise ContractError(
-            f"the contract file cannot be read ({error.strerror}); `veilface calibrate` writes one"
-        ) from None
-    if len(data) > MAX_FILE_BYTES:
-        raise ContractError(f"the contract file is larger than {MAX_FILE_BYTES} bytes")
-    return data
-
-
-def _render(document: Mapping[str, Json]) -> bytes:
-    return json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False).encode("utf-8")

@@ -148,15 +148,6 @@ class Level(JsonValue):
         """What a stranger reaches: the target, or without one the rate that was seen."""
         return self.fmr.value if self.target_fmr is None else self.target_fmr
 
-    def to_json(self) -> dict[str, Json]:
-        """JSON form; without ``frr_by_photos`` and ``groups`` where they are empty."""
-        value = super().to_json()
-        value["score_threshold"] = value.pop("threshold")
-        for name in ("frr_by_photos", "groups"):
-            if not value[name]:
-                del value[name]
-        return value
-
 
 @dataclass(frozen=True)
 class Calibration(JsonValue):
@@ -222,7 +213,7 @@ class Calibration(JsonValue):
 
     def identified(self, contract_id: str) -> "Calibration":
         """Compute the id for one contract."""
-        body: dict[str, Json] = self.to_json()
+        body = self.to_json()
         del body["calibration_id"]
-        bound: dict[str, Json] = {"calibration": body, "contract_id": contract_id}
+        bound = {"calibration": body, "contract_id": contract_id}
         return replace(self, calibration_id=digest(bound))

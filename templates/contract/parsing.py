@@ -10,13 +10,12 @@ code makes is not checked again.
 
 import dataclasses
 from collections.abc import Mapping
-from enum import Enum
 from functools import cache
 from typing import Annotated, Any, ClassVar, Self
 
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
-from templates.contract.canonical import Json, canonical_json, plain_json
+from templates.contract.canonical import Json, canonical_json
 from templates.errors import ContractError
 
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -35,10 +34,17 @@ class JsonValue:
         strict=True, allow_inf_nan=False, val_json_bytes="hex"
     )
 
+    @classmethod
+    @cache
+    def _adapter(cls) -> TypeAdapter[Any]:
+        return TypeAdapter(cls)
+
     def to_json(self) -> dict[str, Json]:
-        """JSON form: the fields by their names."""
-        fields = dataclasses.fields(self)  # type: ignore[arg-type]
-        return {entry.name: _plain(getattr(self, entry.name)) for entry in fields}
+        """JSON form: the fields by their names, and what is computed from them."""
+        written: dict[str, Json] = self._adapter().dump_python(
+            self, mode="json", by_alias=True, warnings=False
+        )
+        return written
 
     @classmethod
     def from_json(cls, value: object, **unwritten: str) -> Self:
@@ -49,12 +55,10 @@ class JsonValue:
         ContractError
             Where a type or a value is wrong, or the value is not what :meth:`to_json` gives.
         """
-        given = plain_json(value)
-        if not isinstance(given, dict):
+        if not isinstance(value, Mapping):
             raise ContractError(f"{cls.what} is not a JSON object")
         try:
-            text = canonical_json({**given, **unwritten})
-            made: Self = _adapter(cls).validate_json(text)  # type: ignore[arg-type]
+            made: Self = cls._adapter().validate_json(canonical_json({**value, **unwritten}))
         except ValidationError as error:
             # Its own text quotes the input.
             first = error.errors(include_input=False, include_url=False, include_context=False)[0]
@@ -63,24 +67,8 @@ class JsonValue:
             raise ContractError(
                 f"{cls.what}{f', {place}' if place else ''}: {first['msg'].lower()}"
             ) from None
-        written = plain_json(made.to_json())
-        if given != written:
+        if canonical_json(made.to_json()) != canonical_json(value):
             raise ContractError(
                 f"{cls.what} has an entry too many or too few, or one that contradicts the others"
             )
         return made
-
-
-@cache
-def _adapter(kind: Any) -> TypeAdapter[Any]:
-    return TypeAdapter(kind)
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, JsonValue):
-        return value.to_json()
-    if isinstance(value, Mapping):
-        return {str(key): _plain(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(entry) for entry in value]
-    return str(value) if isinstance(value, Enum) else value

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, ClassVar, Literal, TypeAlias
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, computed_field
 
 from templates.contract.canonical import Json
 from templates.contract.levels import Rate
@@ -65,6 +65,13 @@ class Judgement(JsonValue):
     shortfall: str | None = None
     bound: Limit | None = None
 
+    @computed_field  # type: ignore[prop-decorator]
+    @property
+    def value(self) -> float:
+        """The measured rate."""
+        return self.rate.value
+
+    @computed_field  # type: ignore[prop-decorator]
     @property
     def upper(self) -> float | None:
         """The one-sided 95 % upper bound of the rate; None without a bound to hold it against."""
@@ -72,6 +79,7 @@ class Judgement(JsonValue):
             return None
         return round(upper_bound(self.rate.errors, self.rate.trials), 6)
 
+    @computed_field  # type: ignore[prop-decorator]
     @property
     def status(self) -> Status:
         """``PASS`` where the rate and its upper bound are within limits, and the data show it."""
@@ -86,11 +94,6 @@ class Judgement(JsonValue):
     def close(self) -> bool:
         """Whether the rate is more than half of the limit, or nothing passes."""
         return self.status != "PASS" or self.rate.value > self.limit / 2
-
-    def to_json(self) -> dict[str, Json]:
-        """JSON form; ``status``, ``value`` and ``upper`` follow from the rest, for readers."""
-        derived = {"status": self.status, "value": self.rate.value, "upper": self.upper}
-        return super().to_json() | derived
 
 
 @dataclass(frozen=True)
@@ -114,7 +117,3 @@ class Verdict(JsonValue):
     privacy: Judgement
     accuracy: Judgement | None = None
     groups: Judgement | None = None
-
-    def to_json(self) -> dict[str, Json]:
-        """JSON form, without what was not measured."""
-        return {name: value for name, value in super().to_json().items() if value is not None}

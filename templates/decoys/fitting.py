@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from templates.errors import DecoyError
+from templates.space.embedding import unit_descriptors
 
 Array = NDArray[np.float64]
 
@@ -36,7 +37,6 @@ _RIDGE = 100.0
 _NEWTON_STEPS = 30
 _FLOOR = 1e-7
 """Of the largest variance; the least that an axis has on which the faces do not vary at all."""
-_UNIT_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -119,18 +119,14 @@ def adapted_moments(
 
 
 def checked_descriptors(descriptors: NDArray[np.floating]) -> Array:
-    """Return embeddings that a fit can take, as float64; otherwise raise `DecoyError`."""
+    """Return embeddings that a fit can take, as float64; otherwise raise a `TemplateError`."""
     x = np.asarray(descriptors)
     if x.ndim != 2 or not MIN_DESCRIPTORS <= x.shape[0] <= MAX_DESCRIPTORS or x.shape[1] < 2:
         raise DecoyError(
             f"a decoy generator is fitted to {MIN_DESCRIPTORS} or more embeddings, shape (N, n); "
             f"seen {x.shape}"
         )
-    x = x.astype(np.float64)
-    # Written so that a NaN fails it too.
-    if not np.all(np.abs(np.linalg.norm(x, axis=1) - 1.0) <= _UNIT_TOLERANCE):
-        raise DecoyError("the embeddings to fit are not all finite unit vectors")
-    return x
+    return unit_descriptors(x)
 
 
 def _principal_axes(x: Array) -> Array:

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from templates.decoys import container
 from templates.decoys.fitting import Moments, adapted_moments, fit_moments
-from templates.decoys.source import MAX_DIMENSION, Attributes, checked_made_with, take_made_with
+from templates.decoys.source import MAX_DIMENSION, Attributes, checked_made_with
 from templates.errors import DecoyError, InvalidEmbedding
 from templates.keys.randomness import Keystream
 from templates.space.embedding import unit_descriptors
@@ -80,7 +80,7 @@ class DecoyGenerator:
         self.axes, self.mean, self.root = (_frozen(part) for part in (axes, mean, root))
         self._check()
         self.n, self.k = self.axes.shape
-        self.made_with: str | None = None if made_with is None else checked_made_with(made_with)
+        self.made_with = checked_made_with(made_with)
         self.source_id: str = hashlib.sha256(self.to_bytes()).hexdigest()
 
     def __repr__(self) -> str:
@@ -205,8 +205,6 @@ class DecoyGenerator:
         A DecoyError where `unlike` or `sub_databases` is asked for: both are choices among labelled
         real embeddings, and choosing by the subject's attributes would leak them (docs/method.md).
         """
-        if rows < 0 or k < 0:
-            raise DecoyError(f"rows and k must not be negative; seen {rows} and {k}")
         if unlike is not None:
             raise DecoyError(
                 "a decoy generator draws independently of the subject's attributes; hybrid+ "
@@ -227,10 +225,7 @@ class DecoyGenerator:
 
     def to_bytes(self) -> bytes:
         """Serialise; equal generators give equal bytes, and `source_id` is their SHA-256."""
-        fields: dict[str, str | int | list[str]] = {
-            "format": GENERATOR_FORMAT,
-            "version": GENERATOR_VERSION,
-        }
+        fields: dict[str, str | int] = {"format": GENERATOR_FORMAT, "version": GENERATOR_VERSION}
         if self.made_with is not None:
             fields["made_with"] = self.made_with
         return container.encode(fields, {name: getattr(self, name) for name in _PARTS})
@@ -241,16 +236,17 @@ class DecoyGenerator:
         fields, arrays = container.decode(
             data, what="decoy generator", max_bytes=MAX_GENERATOR_BYTES
         )
-        made_with = take_made_with(fields)
-        if fields != {"format": GENERATOR_FORMAT, "version": GENERATOR_VERSION}:
+        if (fields.get("format"), fields.get("version")) != (GENERATOR_FORMAT, GENERATOR_VERSION):
             raise DecoyError(
                 f"this is not a decoy generator of version {GENERATOR_VERSION}: build it with "
                 "`veilface decoys build`"
             )
-        if set(arrays) != set(_PARTS) or any(a.dtype != np.float32 for a in arrays.values()):
+        if set(arrays) != set(_PARTS):
             raise DecoyError("the decoy generator has missing or unknown parts")
-        parts = (arrays[name].astype(np.float32) for name in _PARTS)
-        return cls(*parts, made_with=made_with)
+        made = cls(**arrays, made_with=fields.get("made_with"))  # type: ignore[arg-type]
+        if made.to_bytes() != data:
+            raise DecoyError("the decoy generator is not in its canonical encoding")
+        return made
 
     def save(self, path: Path) -> None:
         """Write the generator as a plain file, which clients may have."""

@@ -6,6 +6,7 @@ fault; the pool exists for the paper's strategies, hybrid+ and sub-databases amo
 """
 
 import hashlib
+import json
 from collections import defaultdict
 from collections.abc import Sequence
 from functools import cached_property
@@ -23,24 +24,18 @@ from templates.decoys.source import (
     Attributes,
     DecoySource,
     checked_made_with,
-    take_made_with,
 )
 from templates.errors import DecoyError
 from templates.keys.randomness import Keystream
 from templates.keys.sealing import Sealer
-from templates.space.embedding import unit_rows
+from templates.space.embedding import UNIT_TOLERANCE, unit_rows
 
 POOL_MAGIC = b"VEILFACE DECOY POOL 1\n"
 POOL_CONTEXT = "veilface decoy pool 1"
 MAX_POOL_BYTES = 2 * 1024**3
 MAX_ENTRIES = 1_000_000
-UNIT_TOLERANCE = 1e-3
-# Rounding the numbers of a unit row to float32 moves its length by 2**-24 at most.
-_ROUNDING = 2.0**-23
 _FORMAT = "veilface decoy pool"
-_VERSION = 1
-_UNKNOWN = 255
-_MAX_LABEL = 64
+_VERSION = 2
 
 
 class DecoyPool:
@@ -49,7 +44,7 @@ class DecoyPool:
     Parameters
     ----------
     descriptors
-        float32, shape (N, n), unit rows (tolerance 1e-3). They are renormalised in float64.
+        float32, shape (N, n), unit rows (tolerance 1e-3).
     labels
         One `Attributes` per row, or None. Needed for ``unlike``.
     made_with
@@ -77,14 +72,9 @@ class DecoyPool:
             )
         if not 2 <= array.shape[1] <= MAX_DIMENSION:
             raise DecoyError(f"embeddings must have 2 to {MAX_DIMENSION} numbers each")
-        norms = np.sqrt(np.einsum("ij,ij->i", array, array, dtype=np.float64))
-        wrong = int(np.count_nonzero(~(np.abs(norms - 1.0) <= UNIT_TOLERANCE)))
-        if wrong:
-            raise DecoyError(f"{wrong} of {len(array)} embeddings are not finite unit vectors")
-        # Rows of unit length to float32 rounding stay bit for bit as they are: a second division
-        # could change their last bit, and with it the id of a pool that is loaded again.
-        off = np.abs(norms - 1.0) > _ROUNDING
-        array[off] = array[off].astype(np.float64) / norms[off, None]
+        # Written so that a NaN fails it too.
+        if not (np.abs(np.linalg.norm(array, axis=1) - 1) <= UNIT_TOLERANCE).all():
+            raise DecoyError("the embeddings of a decoy pool are not all finite unit vectors")
         if labels is not None and len(labels) != len(array):
             raise DecoyError(f"{len(labels)} labels for {len(array)} embeddings")
         array.flags.writeable = False
@@ -92,7 +82,7 @@ class DecoyPool:
         self._labels = None if labels is None else tuple(labels)
         self.n: int = array.shape[1]
         self.k: int = self.n
-        self.made_with: str | None = None if made_with is None else checked_made_with(made_with)
+        self.made_with = checked_made_with(made_with)
         self.source_id: str = hashlib.sha256(self._encode()).hexdigest()
 
     def __len__(self) -> int:
@@ -166,8 +156,6 @@ class DecoyPool:
             Fewer than `k` entries qualify, the pool has no labels, or `unlike` and
             `sub_databases` are asked for together (no strategy of docs/method.md §2.1 does).
         """
-        if rows < 0 or k < 0:
-            raise DecoyError(f"rows and k must not be negative; seen {rows} and {k}")
         if unlike is not None and sub_databases is not None:
             raise DecoyError("choose either decoys unlike the subject or sub-databases, not both")
         if unlike is not None:
@@ -236,18 +224,14 @@ class DecoyPool:
             raise DecoyError(f"{k} decoys are needed, but only {available} entries are {where}")
 
     def _encode(self) -> bytes:
-        labels = self._labels
-        fields: dict[str, str | int | list[str]] = {"format": _FORMAT, "version": _VERSION}
+        fields: dict[str, str | int] = {"format": _FORMAT, "version": _VERSION}
         if self.made_with is not None:
             fields["made_with"] = self.made_with
-        if labels is None:
-            return container.encode(fields, {"descriptors": self._descriptors})
-        genders, gender_codes = _coded([label.gender for label in labels])
-        races, race_codes = _coded([label.race for label in labels])
-        return container.encode(
-            {**fields, "genders": genders, "races": races},
-            {"descriptors": self._descriptors, "gender": gender_codes, "race": race_codes},
-        )
+        arrays: dict[str, NDArray[np.generic]] = {"descriptors": self._descriptors}
+        if self._labels is not None:
+            text = json.dumps([[label.gender, label.race] for label in self._labels])
+            arrays["labels"] = np.frombuffer(text.encode(), dtype=np.uint8)
+        return container.encode(fields, arrays)
 
     def save(self, path: Path, sealer: Sealer) -> None:
         """Write the pool, sealed, to a file that only its owner may read."""
@@ -256,37 +240,20 @@ class DecoyPool:
         )
 
     @classmethod
-    def load(cls, path: Path, sealer: Sealer) -> Self:
+    def open(cls, data: bytes, sealer: Sealer) -> Self:
         """Read what `save` wrote; :class:`SealError` where the sealer's key does not open it."""
-        data = container.read_bounded(path, MAX_POOL_BYTES)
-        if not data.startswith(POOL_MAGIC):
-            raise DecoyError(f"{path.name} is not a decoy pool")
-        return cls._decode(sealer.open(data[len(POOL_MAGIC) :], context=POOL_CONTEXT))
-
-    @classmethod
-    def _decode(cls, data: bytes) -> Self:
-        fields, arrays = container.decode(data, what="decoy pool", max_bytes=MAX_POOL_BYTES)
-        if fields.get("format") != _FORMAT or fields.get("version") != _VERSION:
+        plain = sealer.open(data.removeprefix(POOL_MAGIC), context=POOL_CONTEXT)
+        fields, arrays = container.decode(plain, what="decoy pool", max_bytes=MAX_POOL_BYTES)
+        if (fields.get("format"), fields.get("version")) != (_FORMAT, _VERSION):
             raise DecoyError(f"this is not a decoy pool of version {_VERSION}")
-        made_with = take_made_with(fields)
-        try:
-            descriptors, labels = arrays.pop("descriptors"), None
-            if arrays:
-                names = [[*fields.pop(part)] for part in ("genders", "races")]  # type: ignore[misc]
-                codes = [arrays.pop(part).tolist() for part in ("gender", "race")]
-                labels = [
-                    Attributes(*(_named(*pair) for pair in zip(names, entry, strict=True)))
-                    for entry in zip(*codes, strict=True)
-                ]
-            if arrays or set(fields) != {"format", "version"} or descriptors.dtype != np.float32:
-                raise ValueError("more, or other parts")
-        except (KeyError, ValueError, TypeError, IndexError):
-            raise DecoyError("the decoy pool has missing or unknown parts") from None
-        return cls(descriptors.astype(np.float32), labels=labels, made_with=made_with)
-
-
-def _named(names: list[str], code: int) -> str | None:
-    return None if code == _UNKNOWN else str(names[code])
+        labels = None
+        if "labels" in arrays:
+            labels = [Attributes(*label) for label in json.loads(arrays["labels"].tobytes())]
+        return cls(
+            arrays["descriptors"].astype(np.float32),
+            labels=labels,
+            made_with=fields.get("made_with"),  # type: ignore[arg-type]
+        )
 
 
 def _differs(label: Attributes, subject: Attributes) -> bool:
@@ -295,26 +262,12 @@ def _differs(label: Attributes, subject: Attributes) -> bool:
     return all(other is None or (own is not None and own != other) for own, other in pairs)
 
 
-def _coded(values: list[str | None]) -> tuple[list[str], NDArray[np.uint8]]:
-    """Distinct names in order, and per value its place among them (255 for None)."""
-    names = sorted({value for value in values if value is not None})
-    if len(names) >= _UNKNOWN or any(not 1 <= len(name) <= _MAX_LABEL for name in names):
-        raise DecoyError(
-            f"labels must be at most {_UNKNOWN - 1} distinct names of 1 to {_MAX_LABEL} letters"
-        )
-    place: dict[str | None, int] = {name: i for i, name in enumerate(names)}
-    place[None] = _UNKNOWN
-    return names, np.array([place[value] for value in values], dtype=np.uint8)
-
-
 def load_source(path: Path, sealer: Sealer) -> DecoyPool | DecoyGenerator:
     """Load a sealed pool or a plain generator, told apart by the first bytes of the file."""
-    try:
-        with path.open("rb") as file:
-            start = file.read(len(POOL_MAGIC))
-    except OSError as error:
-        raise DecoyError(f"cannot read {path.name}: {error.strerror}") from error
-    return DecoyPool.load(path, sealer) if start == POOL_MAGIC else DecoyGenerator.load(path)
+    data = container.read_bounded(path, MAX_POOL_BYTES)
+    if data.startswith(POOL_MAGIC):
+        return DecoyPool.open(data, sealer)
+    return DecoyGenerator.from_bytes(data)
 
 
 def client_source(source: DecoySource) -> DecoyGenerator:

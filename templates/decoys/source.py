@@ -16,16 +16,11 @@ MAX_DIMENSION = 4096
 _SHA256_HEX = re.compile(r"[0-9a-f]{64}")
 
 
-def take_made_with(fields: dict[str, object]) -> str | None:
-    """Take the ``made_with`` out of the fields of a file that may be hostile; None where absent."""
-    return checked_made_with(fields.pop("made_with")) if "made_with" in fields else None
-
-
-def checked_made_with(value: object) -> str:
-    """Return a valid ``made_with``; refuse anything else."""
-    if not isinstance(value, str) or not _SHA256_HEX.fullmatch(value):
-        raise DecoyError("made_with must be 64 lower-case hexadecimal digits, or absent")
-    return value
+def checked_made_with(value: object) -> str | None:
+    """Return a valid ``made_with`` or None; refuse anything else."""
+    if value is None or (isinstance(value, str) and _SHA256_HEX.fullmatch(value)):
+        return value
+    raise DecoyError("made_with must be 64 lower-case hexadecimal digits, or absent")
 
 
 @dataclass(frozen=True)

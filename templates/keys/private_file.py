@@ -65,6 +65,15 @@ def read_at_most(file: BinaryIO, most: int) -> bytes:
     return b"".join(pieces)
 
 
+def read_bounded(path: Path, most: int) -> bytes:
+    """Read a file of at most ``most`` bytes; an ``OSError`` says that it has more."""
+    with path.open("rb") as file:
+        data = read_at_most(file, most)
+    if len(data) > most:
+        raise OSError(errno.EFBIG, f"it has more than {most} bytes", str(path))
+    return data
+
+
 def read_private(path: Path, most: int, *, source: str, remedy: str, allowed: int = 0) -> bytes:
     """Read a small file, of `most` bytes, that nobody else may read.
 

@@ -15,7 +15,7 @@ import os
 import threading
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn, Protocol, Self
+from typing import NoReturn, Self
 
 from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM
@@ -40,18 +40,6 @@ OVERHEAD_BYTES = 1 + KEY_ID_BYTES + NONCE_BYTES + TAG_BYTES
 
 _VERSION = 1
 _FILE_PURPOSE = "sealer/file"
-
-
-class Sealer(Protocol):
-    """Turns bytes into sealed bytes and back; without the key, only the length shows."""
-
-    def seal(self, plaintext: bytes, *, context: str) -> bytes:
-        """Encrypt `plaintext` so that it opens only with the same `context`."""
-        ...
-
-    def open(self, sealed: bytes, *, context: str) -> bytes:
-        """Decrypt; raise :class:`SealError` for another key, context or any altered byte."""
-        ...
 
 
 def encode_parts(*parts: str | bytes | int) -> bytes:
@@ -146,7 +134,7 @@ class MasterKeyring:
         keys, _ = read_key_file(path)
         fresh = os.urandom(KEY_BYTES)
         write_key_file(path, [fresh, *keys], replace=True)
-        return _key_id(fresh).hex()
+        return _key_id(fresh)
 
     @staticmethod
     def drop_retired(path: str | Path, *, keep: str) -> int:
@@ -159,7 +147,7 @@ class MasterKeyring:
         """
         path = Path(path)
         keys, _ = read_key_file(path)
-        if (first := _key_id(keys[0]).hex()) != keep:
+        if (first := _key_id(keys[0])) != keep:
             raise SealError(
                 f"the first key of the key file {path} is {first}, but what was checked is "
                 f"sealed under {keep}; the file changed meanwhile, and no key was dropped: "
@@ -172,14 +160,13 @@ class MasterKeyring:
     @property
     def current(self) -> str:
         """Key id, 16 hexadecimal digits, of the key that seals."""
-        self._follow_file()
-        return self._keys.ids[0].hex()
+        return self.key_ids[0]
 
     @property
     def key_ids(self) -> tuple[str, ...]:
-        """Ids of all keys, the current one first."""
+        """Ids of all keys, 16 hexadecimal digits each, the current one first."""
         self._follow_file()
-        return tuple(key_id.hex() for key_id in self._keys.ids)
+        return self._keys.ids
 
     @property
     def stale_reason(self) -> str | None:
@@ -200,7 +187,7 @@ class MasterKeyring:
         """
         self._follow_file()
         keys = self._keys
-        header = bytes([_VERSION]) + keys.ids[0]
+        header = bytes([_VERSION]) + bytes.fromhex(keys.ids[0])
         nonce = os.urandom(NONCE_BYTES)
         cipher = AESGCM(keys.derived(keys.ids[0], purpose))
         try:
@@ -215,18 +202,16 @@ class MasterKeyring:
         :class:`SealError` if it names an unknown key, belongs to something else, or was altered.
         """
         key_id = sealed_key_id(sealed)
-        raw_id = bytes.fromhex(key_id)
-        if raw_id not in self._keys.ids:
+        if key_id not in self._keys.ids:
             self._follow_file()
         keys = self._keys
-        if raw_id not in keys.ids:
-            known = ", ".join(own_id.hex() for own_id in keys.ids)
+        if key_id not in keys.ids:
             raise SealError(
-                f"sealed under master key {key_id}, but {self._source} has only {known}: "
-                "put the missing key back as a further line"
+                f"sealed under master key {key_id}, but {self._source} has only "
+                f"{', '.join(keys.ids)}: put the missing key back as a further line"
             )
         header, nonce = sealed[: 1 + KEY_ID_BYTES], sealed[1 + KEY_ID_BYTES :][:NONCE_BYTES]
-        cipher = AESGCM(keys.derived(raw_id, purpose))
+        cipher = AESGCM(keys.derived(key_id, purpose))
         try:
             return cipher.decrypt(
                 nonce,
@@ -263,14 +248,14 @@ class MasterKeyring:
             self._not_followed = None
 
     def __repr__(self) -> str:
-        return f"MasterKeyring({', '.join(key_id.hex() for key_id in self._keys.ids)})"
+        return f"MasterKeyring({', '.join(self._keys.ids)})"
 
     def __reduce__(self) -> NoReturn:
         raise TypeError("a master keyring is not serialised: load it where it is needed")
 
 
-class KeyringSealer:
-    """A :class:`Sealer` under a master keyring, for files: decoy pools, contracts, caches."""
+class Sealer:
+    """Seals files under a master keyring: decoy pools, contracts, caches."""
 
     def __init__(self, keyring: MasterKeyring) -> None:
         self._keyring = keyring
@@ -284,7 +269,7 @@ class KeyringSealer:
         return self._keyring.open(sealed, purpose=_FILE_PURPOSE, bound_to=[context])
 
     def __repr__(self) -> str:
-        return f"KeyringSealer({self._keyring!r})"
+        return f"Sealer({self._keyring!r})"
 
 
 def sealed_key_id(sealed: bytes) -> str:
@@ -297,15 +282,15 @@ def sealed_key_id(sealed: bytes) -> str:
 
 
 class _Keys:
-    """An immutable set of checked keys, and the keys derived from them so far."""
+    """An immutable set of checked keys by their ids, and the keys derived from them so far."""
 
     def __init__(self, keys: Sequence[bytes], *, source: str) -> None:
         check_keys(keys, source=source)
         self._masters = {_key_id(key): key for key in keys}
-        self._derived: dict[tuple[bytes, str], bytes] = {}
+        self._derived: dict[tuple[str, str], bytes] = {}
         self.ids = tuple(self._masters)
 
-    def derived(self, key_id: bytes, purpose: str) -> bytes:
+    def derived(self, key_id: str, purpose: str) -> bytes:
         key = self._derived.get((key_id, purpose))
         if key is None:
             key = derive_key(self._masters[key_id], f"seal/{purpose}")
@@ -317,5 +302,5 @@ def _bind(header: bytes, purpose: str, bound_to: Sequence[str | bytes | int]) ->
     return header + encode_parts(purpose, *bound_to)
 
 
-def _key_id(key: bytes) -> bytes:
-    return hashlib.sha256(derive_key(key, "key-id")).digest()[:KEY_ID_BYTES]
+def _key_id(key: bytes) -> str:
+    return hashlib.sha256(derive_key(key, "key-id")).hexdigest()[: 2 * KEY_ID_BYTES]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from api.http.transfer import MAGIC, PURPOSE, Exported, ExportKey, seal_export
 from templates.contract import wire
 from templates.keys.randomness import Keystream
-from templates.keys.sealing import KeyringSealer, MasterKeyring
+from templates.keys.sealing import MasterKeyring, Sealer
 from templates.space.subspace import SubspaceBatch
 from templates.store.schema import Source
 from tests.fuzz.documents import Raw, hostile
@@ -23,7 +23,7 @@ from tests.fuzz.mutations import mutated, some, span
 CONTRACT = "ab" * 32
 TENANT = "fuzz"
 KEYRING = MasterKeyring([hashlib.sha256(b"fuzz").digest()], source="a test")
-SEALER = KeyringSealer(KEYRING)
+SEALER = Sealer(KEYRING)
 KEY = ExportKey(KEYRING, tenant_bound=True)
 
 SPECIAL = (0.0, -0.0, 1.0, -1.0, 1.0001, 2.0, 1e-45, 1e-38, 6e4, 3e38, -3e38,

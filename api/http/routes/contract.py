@@ -34,7 +34,7 @@ async def get_contract(call: AnyCall) -> ContractAnswer:
     """Right: any. What the contract seals is not part of it."""
     runtime = call.runtime
     tenant = await call.query(lambda: call.store.tenants.get(call.tenant))
-    public: dict[str, Any] = runtime.contract.public()
+    public: dict[str, Any] = runtime.contract.to_json()
     return ContractAnswer(
         **public,
         photos=runtime.pack is not None,

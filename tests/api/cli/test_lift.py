@@ -22,7 +22,7 @@ def public(world, tmp_path):
         world.data / "contract.json", file_sealer(MasterKeyring.load(key_file(world.data)))
     )
     file = tmp_path / "public.json"
-    file.write_text(json.dumps({**contract.public(), "photos": True, "request_id": "x"}))
+    file.write_text(json.dumps({**contract.to_json(), "photos": True, "request_id": "x"}))
     return file
 
 

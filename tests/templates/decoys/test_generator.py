@@ -15,9 +15,9 @@ from templates.decoys import (
 )
 from templates.decoys.fitting import separating_direction
 from templates.decoys.generator import GENERATOR_FORMAT, MAX_GENERATOR_BYTES
-from templates.errors import DecoyError, InvalidEmbedding
+from templates.errors import DecoyError, InvalidEmbedding, TemplateError
 from templates.keys.randomness import Keystream
-from templates.keys.sealing import KeyringSealer, MasterKeyring
+from templates.keys.sealing import MasterKeyring, Sealer
 
 N = 80
 MADE = "5a" * 32
@@ -53,8 +53,6 @@ def test_decoys_are_unit_float32_rows(fitted: DecoyGenerator) -> None:
     np.testing.assert_allclose(norms, 1, atol=1e-6)
     assert fitted.draw(0, 5, stream=Keystream.fresh()).shape == (0, 5, N)
     assert fitted.draw(5, 0, stream=Keystream.fresh()).shape == (5, 0, N)
-    with pytest.raises(DecoyError, match="negative"):
-        fitted.draw(1, -1, stream=Keystream.fresh())
 
 
 def test_no_decoy_comes_twice(fitted: DecoyGenerator) -> None:
@@ -163,12 +161,12 @@ def test_an_adapted_generator_is_nearer_to_the_kind_of_the_sample() -> None:
         (face_like(200, seed=2, n=40), 200, "cannot adapt"),
         (face_like(200, seed=2), 199, "do not fit"),
         (face_like(200, seed=2), 1, "50 or more people"),
-        (2 * face_like(200, seed=2), 200, "unit vectors"),
+        (2 * face_like(200, seed=2), 200, "norm 1"),
     ],
 )
 def test_a_sample_that_cannot_be_adapted_to_is_refused(like: Rows, people: int, words: str) -> None:
     names = ["one"] * len(like) if people == 1 else [str(number) for number in range(people)]
-    with pytest.raises(DecoyError, match=words):
+    with pytest.raises(TemplateError, match=words):
         DecoyGenerator.adapt(face_like(500, seed=1), like, names)
 
 
@@ -211,7 +209,7 @@ def test_few_descriptors_or_dimensions_are_enough_to_fit(count: int, n: int) -> 
     ],
 )
 def test_what_cannot_be_fitted_is_refused(rows: NDArray[np.float64]) -> None:
-    with pytest.raises(DecoyError):
+    with pytest.raises(TemplateError):
         DecoyGenerator.fit(rows)
 
 
@@ -227,7 +225,7 @@ def test_save_and_load(fitted: DecoyGenerator, tmp_path: Path) -> None:
     fitted.save(path)
     assert path.stat().st_mode & 0o777 == 0o600
     assert DecoyGenerator.load(path).source_id == fitted.source_id
-    sealer = KeyringSealer(MasterKeyring.create(tmp_path / "master.key"))
+    sealer = Sealer(MasterKeyring.create(tmp_path / "master.key"))
     loaded = load_source(path, sealer)
     assert isinstance(loaded, DecoyGenerator)
     assert loaded.source_id == fitted.source_id
@@ -290,7 +288,7 @@ def test_too_many_bytes_are_refused_before_they_are_read(tmp_path: Path) -> None
     path = tmp_path / "huge"
     with path.open("wb") as file:
         file.truncate(1 << 40)
-    with pytest.raises(DecoyError, match="at most"):
+    with pytest.raises(DecoyError, match="more than"):
         DecoyGenerator.load(path)
 
 
@@ -350,16 +348,16 @@ def test_what_made_the_embeddings_is_part_of_the_file_and_of_its_id(tmp_path: Pa
     assert np.array_equal(draw(plain, 5, "x"), draw(made, 5, "x"))
 
 
-@pytest.mark.parametrize(
-    "value", [None, 7, "", "a" * 63, "A" * 64, "g" * 64, "a" * 64 + "\n", ["a"]]
-)
+@pytest.mark.parametrize("value", [7, "", "a" * 63, "A" * 64, "g" * 64, "a" * 64 + "\n", ["a"]])
 def test_a_hostile_made_with_is_refused(value: object) -> None:
-    """Null among them: absent and null would be two encodings of one content."""
     generator = DecoyGenerator.fit(face_like(200, seed=1, n=8), made_with=MADE)
     fields, arrays = container.decode(generator.to_bytes(), what="it", max_bytes=10**6)
     data = container.encode({**fields, "made_with": value}, arrays)  # type: ignore[dict-item]
     with pytest.raises(DecoyError, match="made_with must be 64"):
         DecoyGenerator.from_bytes(data)
+    null = container.encode({**fields, "made_with": None}, arrays)  # type: ignore[dict-item]
+    with pytest.raises(DecoyError, match="canonical"):  # absent is the one encoding
+        DecoyGenerator.from_bytes(null)
     if isinstance(value, str):
         with pytest.raises(DecoyError, match="made_with must be 64"):
             DecoyGenerator(generator.axes, generator.mean, generator.root, made_with=value)

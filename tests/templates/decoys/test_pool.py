@@ -21,7 +21,7 @@ from templates.decoys import (
 from templates.decoys.pool import POOL_CONTEXT, POOL_MAGIC
 from templates.errors import DecoyError, SealError
 from templates.keys.randomness import Keystream
-from templates.keys.sealing import KeyringSealer, MasterKeyring
+from templates.keys.sealing import MasterKeyring, Sealer
 
 GENDERS = ("Female", "Male")
 RACES = ("Black", "East Asian", "Indian", "White")
@@ -43,8 +43,8 @@ def pool() -> DecoyPool:
 
 
 @pytest.fixture
-def sealer(tmp_path: Path) -> KeyringSealer:
-    return KeyringSealer(MasterKeyring.create(tmp_path / "master.key"))
+def sealer(tmp_path: Path) -> Sealer:
+    return Sealer(MasterKeyring.create(tmp_path / "master.key"))
 
 
 def indices(pool_rows: NDArray[np.float32], drawn: NDArray[np.float32]) -> NDArray[np.int64]:
@@ -171,16 +171,6 @@ def test_rows_that_are_no_descriptors_are_refused(rows: NDArray[np.float32]) -> 
         DecoyPool(rows)
 
 
-def test_draws_are_unit_and_a_loaded_pool_keeps_its_id() -> None:
-    rough = unit_rows(50, 16) * np.linspace(0.9991, 1.0009, 50, dtype=np.float32)[:, None]
-    pool = DecoyPool(rough)
-    drawn = pool.draw(1, 50, stream=Keystream.seeded(1))[0]
-    norms = np.linalg.norm(drawn.astype(np.float64), axis=1)
-    np.testing.assert_allclose(norms, 1.0, rtol=0, atol=2.0**-23)
-    ordered = drawn[np.argsort((drawn @ rough.T).argmax(axis=1))]
-    assert DecoyPool(ordered).source_id == pool.source_id
-
-
 def test_a_broken_container_does_not_chain_the_parsers_words() -> None:
     header = b'{"a secret of the header": not JSON}'
     with pytest.raises(DecoyError) as caught:
@@ -194,10 +184,6 @@ def test_a_broken_container_does_not_chain_the_parsers_words() -> None:
 def test_labels_must_fit() -> None:
     with pytest.raises(DecoyError, match="2 labels for 3 embeddings"):
         DecoyPool(unit_rows(3, 4), labels=[Attributes()] * 2)
-    with pytest.raises(DecoyError, match="labels must be"):
-        DecoyPool(unit_rows(1, 4), labels=[Attributes("x" * 65, None)])
-    with pytest.raises(DecoyError, match="labels must be"):
-        DecoyPool(unit_rows(300, 4), labels=[Attributes(None, str(i)) for i in range(300)])
 
 
 def test_the_id_names_descriptors_and_labels() -> None:
@@ -241,7 +227,7 @@ def test_a_subset_keeps_rows_labels_and_what_made_them(labelled: bool) -> None:
 
 
 @pytest.mark.parametrize("labelled", [True, False])
-def test_save_and_load(tmp_path: Path, sealer: KeyringSealer, labelled: bool) -> None:
+def test_save_and_load(tmp_path: Path, sealer: Sealer, labelled: bool) -> None:
     labels = [*cross_labels(28), Attributes(None, "White"), Attributes("Male", None)]
     labels_of = labels if labelled else None
     pool = DecoyPool(unit_rows(30, 8), labels=labels_of, made_with="5a" * 32)
@@ -260,7 +246,7 @@ def test_save_and_load(tmp_path: Path, sealer: KeyringSealer, labelled: bool) ->
         assert np.array_equal(ours, loaded.draw(4, 3, stream=same, unlike=unlike))
 
 
-def test_the_file_is_private_and_shows_no_descriptor(tmp_path: Path, sealer: KeyringSealer) -> None:
+def test_the_file_is_private_and_shows_no_descriptor(tmp_path: Path, sealer: Sealer) -> None:
     rows = unit_rows(30, 8)
     path = tmp_path / "decoys.veil"
     DecoyPool(rows, labels=cross_labels(30)).save(path, sealer)
@@ -276,14 +262,14 @@ def test_the_file_is_private_and_shows_no_descriptor(tmp_path: Path, sealer: Key
     assert sorted(p.name for p in tmp_path.iterdir()) == ["decoys.veil", "master.key"]
 
 
-def test_broken_files_are_refused(tmp_path: Path, sealer: KeyringSealer) -> None:
+def test_broken_files_are_refused(tmp_path: Path, sealer: Sealer) -> None:
     path = tmp_path / "decoys.veil"
     DecoyPool(unit_rows(30, 8)).save(path, sealer)
     good = path.read_bytes()
     (tmp_path / "other").mkdir()
-    stranger = KeyringSealer(MasterKeyring.create(tmp_path / "other" / "master.key"))
+    stranger = Sealer(MasterKeyring.create(tmp_path / "other" / "master.key"))
     with pytest.raises(SealError):
-        DecoyPool.load(path, stranger)
+        load_source(path, stranger)
     for broken in (good[:-1], good[:-1] + bytes([good[-1] ^ 1]), POOL_MAGIC):
         path.write_bytes(broken)
         with pytest.raises(SealError):
@@ -292,13 +278,11 @@ def test_broken_files_are_refused(tmp_path: Path, sealer: KeyringSealer) -> None
         path.write_bytes(broken)
         with pytest.raises(DecoyError):
             load_source(path, sealer)
-    with pytest.raises(DecoyError, match="not a decoy pool"):
-        DecoyPool.load(path, sealer)
     with pytest.raises(DecoyError, match=r"cannot read missing\.veil"):
         load_source(tmp_path / "missing.veil", sealer)
 
 
-def test_sealed_content_is_still_checked(tmp_path: Path, sealer: KeyringSealer) -> None:
+def test_sealed_content_is_still_checked(tmp_path: Path, sealer: Sealer) -> None:
     """A seal says who wrote it, not that it is a pool."""
     generator = DecoyGenerator.fit(unit_rows(200, 8))
     path = tmp_path / "decoys.veil"

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from templates.errors import SealError
 from templates.keys.sealing import (
     OVERHEAD_BYTES,
-    KeyringSealer,
     MasterKeyring,
+    Sealer,
     encode_parts,
     sealed_key_id,
 )
@@ -234,7 +234,7 @@ def test_root_does_not_work_on_the_key_file_of_another_user(tmp_path: Path) -> N
 def test_keys_do_not_show(tmp_path: Path) -> None:
     keyring = MasterKeyring.create(tmp_path / "key")
     key = base64.b64decode((tmp_path / "key").read_bytes())
-    shown = repr(keyring) + repr(KeyringSealer(keyring)) + repr(vars(keyring))
+    shown = repr(keyring) + repr(Sealer(keyring)) + repr(vars(keyring))
     for form in (key.hex(), repr(key)[2:-1], base64.b64encode(key).decode()):
         assert form not in shown
     assert keyring.current in repr(keyring)
@@ -251,12 +251,12 @@ def test_a_bad_key_is_not_quoted_in_the_error(tmp_path: Path) -> None:
 
 
 def test_the_sealer_binds_its_context() -> None:
-    sealer = KeyringSealer(MasterKeyring([KEY]))
+    sealer = Sealer(MasterKeyring([KEY]))
     sealed = sealer.seal(b"rows", context="pool 1")
     assert sealer.open(sealed, context="pool 1") == b"rows"
     for other, context in (
         (sealer, "pool 2"),
-        (KeyringSealer(MasterKeyring([OTHER])), "pool 1"),
+        (Sealer(MasterKeyring([OTHER])), "pool 1"),
     ):
         with pytest.raises(SealError):
             other.open(sealed, context=context)
