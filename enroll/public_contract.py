@@ -84,7 +84,7 @@ class PublicContract(BaseModel):
     def require_decoys(self, generator: DecoyGenerator) -> DecoyGenerator:
         """Reduce a generator to the contract's axes; one that is not the contract's is refused."""
         source = generator.reduced(self.binding.axes)
-        self.binding.require_source(source_id=source.source_id, made_with=source.made_with)
+        self.binding.require_source(source)
         return source
 
     def lift(

@@ -84,7 +84,7 @@ def calibrate(
         Where ``source`` is not the binding's.
     """
     options = options or CalibrationOptions()
-    binding.require_source(source_id=source.source_id)
+    binding.require_source(source)
     unit = unit_descriptors(embeddings)
     if unit.shape != (len(identities), binding.n):
         raise ContractError(

@@ -152,7 +152,7 @@ def binding_for(pack: ModelPack, source: DecoySource, *, strategy: Strategy, m: 
         decoy_source_id=source.source_id,
         rotation_version=ROTATION_VERSION,
     )
-    binding.require_source(source_id=source.source_id, made_with=source.made_with)
+    binding.require_source(source)
     return binding
 
 

@@ -124,7 +124,7 @@ def templates(
     source = load_decoys(decoys or settings.resolved_decoys_file, sealer, pack)
     if loaded is not None:
         own = source.reduced(loaded.binding.axes)
-        loaded.binding.require_source(source_id=own.source_id, made_with=own.made_with)
+        loaded.binding.require_source(own)
     elif None in (dim, strategy, axes) and (served := served_scheme(settings, sealer, source)):
         dim, strategy = dim or str(served.m), strategy or served.strategy
         axes = axes or served.axes

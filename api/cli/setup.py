@@ -216,8 +216,7 @@ def _prepared(
         contract = open_contract(settings, keyring)
         if source is None:
             raise CommandError(f"{path} has lost its decoys; remove it to make both anew")
-        served = source.reduced(contract.binding.axes)
-        contract.binding.require_source(source_id=served.source_id, made_with=source.made_with)
+        contract.binding.require_source(source.reduced(contract.binding.axes))
         return contract
     if decoys_kept:
         message(

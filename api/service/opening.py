@@ -228,7 +228,7 @@ def open_decoys(
     with _start_error(f"the decoys file {path} cannot be used"):
         source = load_source(path, file_sealer(keyring)).reduced(contract.binding.axes)
     with _start_error(f"the decoys file {path} is not the contract's"):
-        contract.binding.require_source(source_id=source.source_id, made_with=source.made_with)
+        contract.binding.require_source(source)
     return source
 
 

@@ -9,6 +9,7 @@ from pydantic import Field
 
 from templates.contract.canonical import Json, digest, plain_json
 from templates.contract.parsing import JsonValue, Sha256
+from templates.decoys import DecoySource
 from templates.errors import ContractError, ContractMismatch
 from templates.keys.rotation import ROTATION_VERSION
 from templates.space.lifting import Strategy
@@ -107,22 +108,22 @@ class Binding(JsonValue):
                 "version, build the decoys, calibrate and enroll anew"
             )
 
-    def require_source(self, *, source_id: str, made_with: str | None = None) -> None:
+    def require_source(self, source: DecoySource) -> None:
         """Refuse a decoy source other than the contract's, or of another descriptor space.
 
         A ``made_with`` of None, as of a source made in code, is not held against the binding.
         """
-        if made_with is not None and made_with != self.embedding_id:
+        if source.made_with not in (None, self.embedding_id):
             raise ContractMismatch(
                 "the decoys are embeddings of another model or another preprocessing (made with "
-                f"{made_with[:16]}…, the contract's is {self.embedding_id[:16]}…), and hide "
+                f"{source.made_with[:16]}…, the contract's is {self.embedding_id[:16]}…), and hide "
                 "nothing; build the decoys with this pack and the same --flip, and calibrate "
                 "with them"
             )
-        if source_id != self.decoy_source_id:
+        if source.source_id != self.decoy_source_id:
             raise ContractMismatch(
                 f"the contract is bound to the decoy source {self.decoy_source_id[:16]}…, this one "
-                f"is {source_id[:16]}…; use the file that the contract was calibrated with"
+                f"is {source.source_id[:16]}…; use the file that the contract was calibrated with"
             )
 
     def require_contract(self, contract_id: str, *, what: str) -> None:

@@ -132,7 +132,7 @@ class Contract(JsonValue):
         contract's, reduced to its axes; another one is a ContractMismatch.
         """
         binding = self.binding
-        binding.require_source(source_id=source.source_id, made_with=source.made_with)
+        binding.require_source(source)
         made = self.__dict__.get("_nobody")
         if made is None:
             made = Nobody(client_source(source), binding.strategy, binding.m, self.cohort_seed)

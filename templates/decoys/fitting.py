@@ -12,7 +12,7 @@ how the many faces are to be used, and each step needs little of it:
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,17 +39,8 @@ _FLOOR = 1e-7
 """Of the largest variance; the least that an axis has on which the faces do not vary at all."""
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Moments:
-    """Axes of faces, and mean and covariance of the coordinates along them.
-
-    Attributes
-    ----------
-    axes
-        float64, shape (n, n). Orthonormal columns, of the largest variance of the faces first.
-    mean, covariance
-        float64, shapes (n,) and (n, n), of coordinates along the axes.
-    """
+class Moments(NamedTuple):
+    """Orthonormal axes of faces, as columns (n, n), and moments of the coordinates along them."""
 
     axes: Array
     mean: Array

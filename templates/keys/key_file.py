@@ -3,13 +3,14 @@
 import base64
 import binascii
 import os
+import stat
 from collections.abc import Sequence
 from pathlib import Path
 
 from templates.errors import SealError
 from templates.keys.private_file import (
     create_private,
-    read_private,
+    read_at_most,
     refuse_another_users,
     replace_private,
 )
@@ -70,18 +71,35 @@ def read_key_file(path: Path) -> tuple[list[bytes], Stamp]:
         and not folder.stat().st_mode & 0o022
     )
     stamp = stamp_of(path.stat())
-    data = read_private(
-        path,
-        _MAX_FILE_BYTES,
-        source=source,
-        remedy="`chmod 600` it, and replace the keys if others could have read them",
-        allowed=0o040 if is_credential else 0,
-    )
+    data = _read_private(path, source, allowed=0o040 if is_credential else 0)
     try:
         text = data.decode("ascii")
     except UnicodeDecodeError:
         raise SealError(f"{source} is not text: it holds one base64 key on each line") from None
     return keys_in(text, source=source), stamp
+
+
+def _read_private(path: Path, source: str, *, allowed: int) -> bytes:
+    """Read a file that nobody else may read, but for the `allowed` bits of the mode."""
+    try:
+        # Not blocking: a named pipe in the place of the file would hold the reader for ever.
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+        mode = os.fstat(descriptor).st_mode
+        if not stat.S_ISREG(mode):
+            os.close(descriptor)
+            raise SealError(f"{source} is not a regular file")
+        with os.fdopen(descriptor, "rb") as file:
+            data = read_at_most(file, _MAX_FILE_BYTES)
+    except OSError as error:
+        raise SealError(f"{source} cannot be read: {error.strerror}") from None
+    if mode & 0o077 & ~allowed:
+        raise SealError(
+            f"{source} may be read by others (mode {stat.S_IMODE(mode):04o}): `chmod 600` it, and "
+            "replace the keys if others could have read them"
+        )
+    if len(data) > _MAX_FILE_BYTES:
+        raise SealError(f"{source} has more than {_MAX_FILE_BYTES} bytes")
+    return data
 
 
 def write_key_file(path: Path, keys: Sequence[bytes], *, replace: bool) -> None:

@@ -7,11 +7,8 @@ service could not read it afterwards, and a user could have chosen the place.
 import errno
 import os
 import secrets
-import stat
 from pathlib import Path
 from typing import BinaryIO
-
-from templates.errors import SealError
 
 _PIECE = 2**20
 
@@ -71,31 +68,6 @@ def read_bounded(path: Path, most: int) -> bytes:
         data = read_at_most(file, most)
     if len(data) > most:
         raise OSError(errno.EFBIG, f"it has more than {most} bytes", str(path))
-    return data
-
-
-def read_private(path: Path, most: int, *, source: str, remedy: str, allowed: int = 0) -> bytes:
-    """Read a small file, of `most` bytes, that nobody else may read.
-
-    `source` and `remedy` are what messages call the file, and what to do where others may read it;
-    `allowed` are bits of the mode for group and others that are no fault. A :class:`SealError` says
-    what is wrong.
-    """
-    try:
-        # Not blocking: a named pipe in the place of the file would hold the reader for ever.
-        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
-        mode = os.fstat(descriptor).st_mode
-        if not stat.S_ISREG(mode):
-            os.close(descriptor)
-            raise SealError(f"{source} is not a regular file")
-        with os.fdopen(descriptor, "rb") as file:
-            data = read_at_most(file, most)
-    except OSError as error:
-        raise SealError(f"{source} cannot be read: {error.strerror}") from None
-    if mode & 0o077 & ~allowed:
-        raise SealError(f"{source} may be read by others (mode {stat.S_IMODE(mode):04o}): {remedy}")
-    if len(data) > most:
-        raise SealError(f"{source} has more than {most} bytes")
     return data
 
 

@@ -112,7 +112,7 @@ class Keystream:
         while pending.size:
             drawn = np.frombuffer(self.token(8 * pending.size), dtype=np.uint64)
             words[pending] = drawn
-            pending = pending[drawn >= np.uint64(2**64 - surplus)] if surplus else pending[:0]
+            pending = pending[drawn > np.uint64(2**64 - 1 - surplus)]
         return (words % np.uint64(bound)).astype(np.int64)
 
     def choose(self, population: int, rows: int, k: int) -> NDArray[np.int64]:

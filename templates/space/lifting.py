@@ -84,12 +84,7 @@ def lift_stream(
     """Return the stream that one set of photos is lifted from: the same whenever they come again.
 
     Two lifts of one descriptor with different decoys meet in it (docs/method.md §4.6). From this
-    stream they are one set, which tells no more than either; other photos give other decoys.
-
-    Only a template that its holder's key turns is told apart by tenant and subject: nobody sees two
-    of those meet without the keys, and one set would show by the length of its foot point, which
-    no rotation hides, that two enrollments are of the same photos (docs/privacy.md "Attacker
-    by attacker").
+    stream they are one set, which tells no more than either.
 
     Parameters
     ----------
@@ -97,10 +92,11 @@ def lift_stream(
         32 random bytes of the deployment. With these very pixels they give the decoys.
     photos : sequence of bytes
         What was sent, in any order, however often each: digests of the decoded photos, or the bytes
-        of embeddings. Not the files: others of the same pixels give the same embedding. Nor what a
-        model made of them, which another processor rounds in another way.
+        of embeddings. Not what a model made of photos, which another processor rounds otherwise.
     holder : (tenant, subject), optional
-        Whose key turns the template; not the key, which may be replaced by another one.
+        Whose key turns the template. Nobody sees two such templates meet without the keys, and one
+        set would show, by the length of its foot point, that two enrollments are of the same photos
+        (docs/privacy.md "Attacker by attacker"). So tenant and subject tell the streams apart.
     """
     digests = sorted({hashlib.sha256(photo).digest() for photo in photos})
     whose = ["lift"] if holder is None else ["lift for a holder", *holder]

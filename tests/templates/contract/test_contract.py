@@ -255,21 +255,23 @@ def test_the_embedding_id_names_the_weights_and_the_preprocessing() -> None:
 
 
 def test_mismatches_name_both_sides() -> None:
+    source = make_source()
+    parts = source.axes, source.mean, source.root
     binding = make_binding()
+    bound = make_binding(decoy_source_id=source.source_id)
+    bound.require_source(source)
     same = {"embedder_sha256": "ab" * 32, "preprocessing": dict(binding.preprocessing), "n": N}
     binding.require_embedder(**same)
-    binding.require_source(source_id="cd" * 32)
     binding.require_contract(binding.contract_id, what="it")
     with pytest.raises(ContractMismatch, match=r"abab.*pack's is efef"):
         binding.require_embedder(**{**same, "embedder_sha256": "ef" * 32})
     preprocessing = {**binding.preprocessing, "size": 96, "x": 1}
     with pytest.raises(ContractMismatch, match=r"size: contract 112, pack 96; x: contract None"):
         binding.require_embedder(**{**same, "preprocessing": preprocessing})
-    with pytest.raises(ContractMismatch, match=r"cdcd.*0000"):
-        binding.require_source(source_id="00" * 32)
-    binding.require_source(source_id="cd" * 32, made_with=binding.embedding_id)
+    with pytest.raises(ContractMismatch, match=rf"cdcd.*{source.source_id[:16]}"):
+        binding.require_source(source)
     with pytest.raises(ContractMismatch, match="build the decoys with this pack and the same --fl"):
-        binding.require_source(source_id="cd" * 32, made_with="00" * 32)
+        binding.require_source(DecoyGenerator(*parts, made_with="00" * 32))
     with pytest.raises(ContractMismatch, match=r"it belongs to the contract 1111.*runs"):
         binding.require_contract("1" * 64, what="it")
 
