@@ -185,12 +185,7 @@ class SubspaceBatch:
         spread = np.asarray(directions)
         if start.ndim == 1:
             start, spread = start[None], spread[None]
-        if start.ndim != 2 or spread.ndim != 3:
-            raise LiftingError(
-                f"expected points (N, n) and directions (N, m, n), "
-                f"seen {start.ndim} and {spread.ndim} axes"
-            )
-        count, m, n = spread.shape
+        count, m, n = spread.shape if spread.ndim == 3 else (0, 0, 0)
         if start.shape != (count, n) or not 1 <= m < n:
             raise LiftingError(
                 f"points of shape {start.shape} and directions of shape {spread.shape} do not "

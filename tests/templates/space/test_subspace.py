@@ -150,11 +150,10 @@ def test_degenerate_requests_are_refused():
         (stream.normal((8, 8)), "1 <= m < n"),
         (stream.normal((0, 8)), "1 <= m < n"),
         (stream.normal((3, 9)), "do not fit"),
+        (directions[None, None], "do not fit"),
     ):
         with pytest.raises(LiftingError, match=reason):
             SubspaceBatch.through(point, bad, stream=stream)
-    with pytest.raises(LiftingError, match="axes"):
-        SubspaceBatch.through(point, directions[None], stream=stream)
 
 
 def test_validation_names_each_fault():
