@@ -21,10 +21,10 @@ from templates.decoys import DecoyGenerator, DecoyPool, DecoySource
 from templates.distances import Metric
 from templates.errors import Uncalibrated
 from templates.keys.randomness import KEY_BYTES, Keystream
-from templates.keys.rotation import ROTATION_VERSION
 from templates.space.lifting import Strategy
 from verify import CalibrationOptions, calibrate
 from verify.own_decoys import require_others
+from verify.preparation import binding_for
 
 DEFAULT_SHARE = 0.83
 """Of the decoys' variance, on the axes that are taken where nobody says how many."""
@@ -150,16 +150,7 @@ def audit_bed(
     """
     if isinstance(source, DecoyGenerator):
         source = source.reduced(axes or source.axes_for(DEFAULT_SHARE))
-    binding = Binding(
-        embedder_sha256=pack.info.embedder_sha256,
-        preprocessing=dict(pack.info.preprocessing),
-        n=source.n,
-        axes=source.k,
-        strategy=strategy,
-        m=m,
-        decoy_source_id=source.source_id,
-        rotation_version=ROTATION_VERSION,
-    )
+    binding = binding_for(pack, source, strategy=strategy, m=m)
     contract = None if compared else plan.contract
     if contract is None:
         contract = _calibrated(population, binding, source, plan)

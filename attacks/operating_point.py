@@ -65,20 +65,13 @@ Advance: TypeAlias = Callable[[float], None]
 
 @dataclass(frozen=True)
 class Tried:
-    """A pair of axes and dimension that was considered.
-
-    Parameters
-    ----------
-    theft
-        Share of templates that the strongest attacker is expected to open.
-    rejected
-        Single genuine photos that are rejected at FMR 1e-3, by a quick estimate; None where that
-        was not estimated: the pair is not private, or nobody has two photos.
-    """
+    """A pair of axes and dimension that was considered."""
 
     axes: int
     m: int
-    theft: float
+    theft: float  # share of templates that the strongest attacker is expected to open
+    # Single genuine photos that are rejected at FMR 1e-3, by a quick estimate; None where that was
+    # not estimated: the pair is not private, or nobody has two photos.
     rejected: Rate | None = None
 
     def to_json(self) -> dict[str, Json]:
@@ -93,25 +86,13 @@ class Tried:
 
 @dataclass(frozen=True)
 class OperatingPoint:
-    """The pair of axes and dimension, why it was chosen, and how private it is.
+    """The pair of axes and dimension, why it was chosen, and how private it is."""
 
-    Parameters
-    ----------
-    axes, dim
-        k and m.
-    chosen
-        Why these: a few words.
-    tried
-        What was considered, each with what it would cost.
-    privacy
-        Of people who had no part in the choice.
-    """
-
-    axes: int
-    dim: int
-    chosen: str
-    tried: tuple[Tried, ...]
-    privacy: Judgement
+    axes: int  # k
+    dim: int  # m
+    chosen: str  # why these: a few words
+    tried: tuple[Tried, ...]  # what was considered, each with what it would cost
+    privacy: Judgement  # of people who had no part in the choice
 
 
 def choose_and_judge(
@@ -125,14 +106,8 @@ def choose_and_judge(
 ) -> OperatingPoint:
     """Choose axes and dimension on one half of the victims, and judge them on the other.
 
-    Parameters
-    ----------
-    axes, m
-        What is not to be chosen. With both, all victims are judged.
-    uncovered
-        As in :func:`judge_privacy`.
-    progress
-        Called with the share that is done.
+    ``axes`` and ``m`` are what is not to be chosen; with both, all victims are judged. For
+    ``uncovered`` see :func:`judge_privacy`; ``progress`` gets the share that is done.
     """
     if axes is not None and m is not None:
         chosen, judged = "asked for", setup
@@ -171,13 +146,7 @@ def choose(
 
     Theft is measured on the victims and on drawn people, and the larger counts. Where nobody has
     two photos, the smallest share of directions in the axes is taken instead: at equal shares
-    about as many are rejected.
-
-    Returns
-    -------
-    axes, m : int
-    chosen : str
-    tried : tuple of Tried
+    about as many are rejected. Returns k, m, why, and what was tried.
     """
     grid = axes_to_try(setup.source) if axes is None else (axes,)
     grid = tuple(k for k in grid if m is None or m < k) or (setup.source.k,)
@@ -223,14 +192,9 @@ def dims_to_try(axes: int) -> tuple[int, ...]:
 def judge_privacy(
     thefts: Sequence[Recovery], *, axes: int, m: int, uncovered: str | None = None
 ) -> Judgement:
-    """Hold what the strongest attacker gets, and its upper bound, against the limits.
+    """Hold what the strongest of :func:`thieves` gets, and its upper bound, against the limits.
 
-    Parameters
-    ----------
-    thefts
-        Of :func:`thieves`.
-    uncovered
-        What an attacker of such templates has and none of these had, in a sentence; None: nothing.
+    ``uncovered`` is what an attacker of such templates has and none of these had, in a sentence.
     """
     strongest = max(thefts, key=_strength).to_json()
     faces = max(theft.faces or 0 for theft in thefts)
@@ -339,12 +303,8 @@ def judge_accuracy(contract: Contract, *, photos: int, not_acquired: int) -> Jud
     """Hold the FRR of the default level, with the advised photos, against its limit.
 
     It counts the probes that are refused because their photos do not agree. Photos without a usable
-    face are no probes: a folder's tell nothing of a camera's. The verdict says how many there were.
-
-    Parameters
-    ----------
-    photos, not_acquired
-        Photos that the calibration was given, and those of them without a usable face.
+    face are no probes: a folder's tell nothing of a camera's. The verdict says how many there were
+    (``not_acquired``) among the ``photos`` of the calibration.
     """
     name = contract.default_level
     calibration = contract.calibration("p2s", probe_photos=ADVISED_PHOTOS, level=name)
@@ -372,11 +332,7 @@ def judge_accuracy(contract: Contract, *, photos: int, not_acquired: int) -> Jud
 def rejected_as_advised(level: Level) -> tuple[int | None, Rate]:
     """Return the FRR of templates of the advised number of photos, or the next below it.
 
-    Returns
-    -------
-    enrolled : int or None
-        The number of photos; None where the level counts all templates together.
-    rate : Rate
+    The number of photos comes first; None where the level counts all templates together.
     """
     rates = level.frr_by_photos or level.fnmr_by_photos
     enrolled = max((p for p in rates if p <= ADVISED_PHOTOS), default=min(rates, default=None))

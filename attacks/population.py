@@ -50,14 +50,9 @@ class Population:
 def draw_population(
     embeddings: Array, identities: Sequence[str], *, victims: int, owners: int, seed: int
 ) -> Population:
-    """Divide the people of a labelled folder into groups, at random.
+    """Divide the people of a labelled folder, (N, n) unit rows, into groups at random.
 
-    Parameters
-    ----------
-    embeddings : (N, n) floating
-        Unit rows.
-    victims, owners
-        How many; of people with two photos or more.
+    ``victims`` and ``owners`` are how many, of people with two photos or more.
 
     Raises
     ------
@@ -66,8 +61,6 @@ def draw_population(
     """
     rows = unit_descriptors(embeddings)
     people, person_of = np.unique(np.asarray(identities, dtype=np.str_), return_inverse=True)
-    if len(person_of) != len(rows):
-        raise AuditError(f"{len(identities)} names do not fit {len(rows)} embeddings")
     rng = np.random.default_rng(seed)
     photos = np.split(np.argsort(person_of, kind="stable"), np.bincount(person_of).cumsum()[:-1])
     several = rng.permutation([i for i, photo_rows in enumerate(photos) if len(photo_rows) > 1])

@@ -16,7 +16,7 @@ from templates.errors import InvalidEmbedding
 from templates.space.embedding import unit_rows
 from templates.space.subspace import SubspaceBatch
 from verify.cohort import Probes as Sent
-from verify.cohort import cohort_statistics, expected_similarity
+from verify.cohort import expected_similarity
 
 WITH_KEY, WITHOUT_KEY = "with the key", "without the key"
 
@@ -89,26 +89,15 @@ def scored(
     calibration: Calibration,
     *,
     paired: bool = False,
-    cohort: SubspaceBatch | None = None,
 ) -> NDArray[np.float64]:
     """Score as ``verify.Verifier`` does, (P, T), or (P,) where probe i meets template i only.
 
     Neither probes nor templates are rotated: a rotation of both changes nothing.
-
-    Parameters
-    ----------
-    probes : (P, k) float32, or SubspaceBatch of P
-    cohort
-        Of lifted probes, instead of the contract's secret one: an attacker tries with one of their
-        own.
     """
     compare = paired_distances if paired else pairwise_distances
     metric, steps = calibration.metric, calibration.steps
     similarities = similarity(compare(probes, templates, metric=metric, steps=steps))
-    if cohort is not None and isinstance(probes, SubspaceBatch):
-        means, spreads = cohort_statistics(probes, cohort, metric=metric, steps=steps)
-    else:
-        means, spreads = expected_similarity(probes, nobody, metric=metric, steps=steps)
+    means, spreads = expected_similarity(probes, nobody, metric=metric, steps=steps)
     if not paired:
         means, spreads = means[:, None], spreads[:, None]
     return np.asarray((similarities - means) / spreads, dtype=np.float64)

@@ -33,27 +33,16 @@ OVERLAPPING = ((0, 1, 2), (0, 1, 3))
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Recovery:
-    """One variant of an attack that guesses embeddings, scored.
-
-    Parameters
-    ----------
-    matched
-        Guesses that match a fresh photo of the person, at raw FMR 1e-3.
-    control
-        Those that match the photo of the next person, as should happen by chance only.
-    auc
-        Probability that a guess is nearer to a photo of its own person than to one of another:
-        0.5 where it tells nothing. It shows what leaks where nothing crosses the threshold.
-    to_truth
-        Mean cosine to the embedding that was lifted.
-    """
+    """One variant of an attack that guesses embeddings, scored."""
 
     attack: str
     guesses: Guesses
-    matched: Rate
-    control: Rate
+    matched: Rate  # guesses that match a fresh photo of the person, at raw FMR 1e-3
+    control: Rate  # those that match the photo of the next person: by chance only
+    # Probability that a guess is nearer to a photo of its own person than to one of another. It
+    # shows what leaks where nothing crosses the threshold.
     auc: float
-    to_truth: float
+    to_truth: float  # mean cosine to the embedding that was lifted
 
     @property
     def faces(self) -> int | None:

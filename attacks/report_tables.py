@@ -69,7 +69,7 @@ _OUTCOMES: Columns = {
     "judged": lambda row: "yes" if row["judged"] else f"no: {plain(row['unjudged'])}",
 }
 _LIMITS: Columns = {
-    "limit": lambda limit: f"`--max-{limit['name']}`",
+    "limit": lambda limit: f"`{limit['name']}`",
     "most": lambda limit: significant(limit["most"]),
     "on": lambda limit: limit["meaning"],
 }

@@ -77,26 +77,15 @@ class AttackSetup:
         photos: int = 3,
         seed: int = 0,
     ) -> "AttackSetup":
-        """Shuffle the attacker's faces.
-
-        Parameters
-        ----------
-        victims
-            People who are in no fit and none of the attacker's.
-        faces : (A, n) float32
-            Of other people of the same kind.
-        owners : (A,) int64
-            Whose each is; None: of a person of its own.
+        """Shuffle the attacker's faces, which are of people of their own where owners are None.
 
         Raises
         ------
         AuditError
-            Fewer than two faces, nobody to attack, or embeddings of other dimensions.
+            Fewer than two faces, or nobody to attack.
         """
-        if len(faces) < 2 or not len(victims) or victims.enrolled.shape != victims.fresh.shape:
+        if len(faces) < 2 or not len(victims):
             raise AuditError("privacy is measured on people with a fresh photo each, and on faces")
-        if not victims.enrolled.shape[1] == faces.shape[1] == source.n:
-            raise AuditError(f"the decoys are of {source.n} numbers, and the faces of others")
         order = np.random.default_rng([seed, 1]).permutation(len(faces))
         return cls(
             victims,
@@ -188,12 +177,7 @@ class AttackSetup:
     ) -> Testbed:
         """Project on the leading axes, lift the victims, and let attackers estimate what they can.
 
-        Parameters
-        ----------
-        quick
-            Only attackers with all faces.
-        contract
-            What decides about probes; None where none are sent.
+        ``quick`` has only attackers with all faces; ``contract`` decides about probes, where sent.
         """
         source = self.source.reduced(axes)
         decoys = Moments.of(decoy_moment(source))

@@ -47,7 +47,7 @@ class Limit:
     Parameters
     ----------
     name
-        Of the option, ``--max-<name>``, and of the field in the report.
+        Of the field in the report, and in ``--limit NAME=SHARE``.
     default
         The most that passes; 1 limits nothing.
     meaning
@@ -97,8 +97,8 @@ LIMITS: tuple[Limit, ...] = (
     Limit(
         WITH_KEY,
         1.0,
-        "what no template withstands where every key leaked: it is sent itself, or several are of "
-        "one person",
+        "what no template withstands where every key leaked: it holds vectors that it accepts, as "
+        "does a renewed one of the same face, and several of one person meet in the person",
     ),
     Limit(
         WITHOUT_KEY,
@@ -115,14 +115,6 @@ _BY_PROPERTY = {
 }
 _OF_A_TEMPLATE = (Property.IRREVERSIBILITY, Property.CONFIDENTIALITY)
 """Properties that one template should have without any rotation."""
-_BY_DESIGN = {
-    Property.IRREVERSIBILITY: "templates of several photos of one person come near each other in "
-    "the person",
-    Property.RENEWABILITY: "the renewed template holds the same face, and the same photos give the "
-    "same template again",
-    Property.IMPERSONATION: "an un-rotated template holds vectors that it accepts",
-}
-"""Why no template can hold what is without a limit."""
 _BY_ATTACK = {"foot-point": FOOT_POINT}
 """Attacks with a limit of their own, and so a cell of their own."""
 
@@ -155,13 +147,6 @@ class Cell:
         return Status.PASS if shown else Status.NOT_SHOWN
 
     @property
-    def reason(self) -> str | None:
-        """Why nobody can set a limit: what succeeds does so by design."""
-        if self.status is not Status.UNLIMITED or self.limit != WITH_KEY:
-            return None
-        return _BY_DESIGN.get(self.outcome.breaks)
-
-    @property
     def rank(self) -> tuple[int, float]:
         """What the strongest attack is chosen by: a doubt counts more than a small success."""
         return _GRAVITY.index(self.status), self.excess
@@ -184,7 +169,6 @@ class Cell:
             "limit": self.limit,
             "most": self.most,
             "status": str(self.status),
-            "reason": self.reason,
         }
 
 
@@ -230,18 +214,8 @@ def judge(
 ) -> list[Verdict]:
     """Judge every scheme by the strongest attack on each property, theft and knowledge.
 
-    Parameters
-    ----------
-    outcomes
-        Of any number of schemes; those that are not ``judged`` fill no cell. A scheme that has
-        nothing but controls, or is there to compare with, gets no verdict.
-    limits
-        By name; the defaults of :data:`LIMITS` where absent.
-
-    Returns
-    -------
-    list of Verdict
-        One a scheme, in the order of their first outcome.
+    Outcomes that are not ``judged`` fill no cell. A scheme that has nothing but controls, or is
+    there to compare with, gets no verdict. ``limits`` go by name; absent ones are the defaults.
     """
     most = {limit.name: limit.default for limit in LIMITS} | dict(limits or {})
     by_scheme: dict[Scheme, list[AttackOutcome]] = {}
@@ -357,9 +331,8 @@ _SAID = {
 def _sentence(cell: Cell) -> str:
     outcome = cell.outcome
     bound = "" if cell.status is Status.UNLIMITED else f", limit {cell.most:.3g}"
-    reason = "" if cell.reason is None else f" By design: {cell.reason}."
     return (
         f"{outcome.breaks} {_SAID[cell.status]}: {outcome.name}, leaked {outcome.leaked}, "
         f"attacker with {outcome.knowledge}: "
-        f"{cell.excess:.3g} [{cell.low:.3g}, {cell.high:.3g}]{bound}.{reason}"
+        f"{cell.excess:.3g} [{cell.low:.3g}, {cell.high:.3g}]{bound}."
     )

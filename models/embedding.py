@@ -66,14 +66,6 @@ class Embedder:
         raw = self._raw(self._checked(crops))
         return self._normalised(raw + self._raw(crops[:, :, ::-1]) if flip else raw)
 
-    def embed_both(self, crops: NDArray[np.uint8]) -> tuple[Rows, Rows]:
-        """Embed aligned crops without and with the mirror image, at the cost of the latter.
-
-        Parameters and errors as in :meth:`embed`.
-        """
-        raw = self._raw(self._checked(crops))
-        return self._normalised(raw), self._normalised(raw + self._raw(crops[:, :, ::-1]))
-
     def _checked(self, crops: NDArray[np.uint8]) -> NDArray[np.uint8]:
         size = self.preprocessing.size
         if crops.dtype != np.uint8 or crops.ndim != 4 or crops.shape[1:] != (size, size, 3):

@@ -4,7 +4,7 @@ import hashlib
 import json
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -41,10 +41,6 @@ class Photo:
             return file.read(MAX_BYTES + 1)
 
 
-Embeddings = tuple[NDArray[np.float32], ...]
-"""What one photo gave: its embedding, or the one without and the one with the mirror image."""
-
-
 @dataclass(frozen=True)
 class Failure:
     """A file from which no embedding was acquired, and why."""
@@ -62,7 +58,6 @@ class Extraction:
     paths: list[Path]  # that were embedded, in the order in which they were given
     failures: list[Failure]  # all others
     cached: int
-    mirrored: NDArray[np.float32] | None = field(default=None, repr=False)
 
     @property
     def attempts(self) -> int:
@@ -84,9 +79,6 @@ class Extractor:
     ----------
     cache
         Where known embeddings are kept; ``None`` computes all anew.
-    mirrored
-        Embed every face with the mirror image added too, beside the embedding without it; the
-        pack must be one without.
     """
 
     def __init__(
@@ -95,18 +87,11 @@ class Extractor:
         *,
         cache: EmbeddingCache | None = None,
         aligned: bool = False,
-        mirrored: bool = False,
     ) -> None:
-        if mirrored and pack.info.preprocessing["flip"]:
-            raise ValueError("the pack adds the mirror image already")
         self._pack = pack
         self._cache = cache
         self._aligned = aligned or pack.info.detector is None
-        # One kind of embedding, or the two kinds that are made together.
-        self._kinds = tuple(
-            self._settings_digest({**pack.info.preprocessing, "flip": flip})
-            for flip in ([False, True] if mirrored else [pack.info.preprocessing["flip"]])
-        )
+        self._kind = self._settings_digest()
 
     def extract(
         self, photos: Iterable[Path | Photo], *, progress: Advance | None = None
@@ -127,19 +112,12 @@ class Extractor:
             if self._cache is not None:
                 self._cache.flush()
         done = [(Path(file.name), item) for file, item in zip(files, prepared, strict=True)]
-        rows = [item.embeddings for _, item in done if item.failure is None]
-        kinds = [
-            np.stack([row[kind] for row in rows])
-            if rows
-            else np.empty((0, self._pack.info.n), np.float32)
-            for kind in range(len(self._kinds))
-        ]
+        rows = [item.embedding for _, item in done if item.embedding is not None]
         return Extraction(
-            kinds[0],
+            np.stack(rows) if rows else np.empty((0, self._pack.info.n), np.float32),
             [path for path, item in done if item.failure is None],
             [item.failure for item in prepared if item.failure is not None],
             sum(item.is_cached for item in prepared),
-            kinds[1] if len(kinds) == 2 else None,
         )
 
     def _keep(self, after: float) -> float:
@@ -151,7 +129,7 @@ class Extractor:
         ended = time.monotonic()
         return ended + max(_KEPT_SECONDS, 20 * (ended - began))
 
-    def _settings_digest(self, preprocessing: Mapping[str, object]) -> bytes:
+    def _settings_digest(self) -> bytes:
         """Everything besides the picture that an embedding depends on."""
         info = self._pack.info
         detector = None
@@ -159,7 +137,7 @@ class Extractor:
             detector = [info.detector.sha256, list(info.detector.input_size)]
         settings = {
             "embedder": info.embedder_sha256,
-            "preprocessing": preprocessing,
+            "preprocessing": dict(info.preprocessing),
             "detector": detector,
             "turned": "refused",
         }
@@ -170,22 +148,20 @@ class Extractor:
         path = Path(photo.name)
         try:
             data = photo.read()
-            content = hashlib.sha256(data).digest()
-            key = tuple(hashlib.sha256(kind + content).digest() for kind in self._kinds)
-            known = () if self._cache is None else tuple(self._cache.get(part) for part in key)
-            embeddings = tuple(embedding for embedding in known if embedding is not None)
-            if len(embeddings) == len(key):
-                return _Prepared(key, embeddings=embeddings, is_cached=True)
+            key = hashlib.sha256(self._kind + hashlib.sha256(data).digest()).digest()
+            embedding = None if self._cache is None else self._cache.get(key)
+            if embedding is not None:
+                return _Prepared(key, embedding=embedding, is_cached=True)
             if self._aligned:
                 crop = self._pack.as_aligned(decode_image(data))
             else:
                 crop = self._pack.crop_photo(data, policy=None, quality=None).crop
             return _Prepared(key, crop=crop)
         except (ImageError, FaceError) as error:
-            return _Prepared((), failure=Failure(path, error.code, str(error)))
+            return _Prepared(b"", failure=Failure(path, error.code, str(error)))
         except OSError as error:
             reason = f"The file cannot be read: {error.strerror}."
-            return _Prepared((), failure=Failure(path, "unreadable_file", reason))
+            return _Prepared(b"", failure=Failure(path, "unreadable_file", reason))
 
     def _embedded(self, chunk: Sequence["_Prepared"]) -> list["_Prepared"]:
         """Embed the crops of a chunk in batches; copies of one file are computed once."""
@@ -193,26 +169,22 @@ class Extractor:
         if not unique:
             return list(chunk)
         crops = np.stack(list(unique.values()))
-        kinds: tuple[NDArray[np.float32], ...] = (
-            self._pack.embed_both(crops) if len(self._kinds) == 2 else (self._pack.embed(crops),)
-        )
-        made = dict(zip(unique, zip(*kinds, strict=True), strict=True))
+        made = dict(zip(unique, self._pack.embed(crops), strict=True))
         if self._cache is not None:
-            for key, embeddings in made.items():
-                for part, embedding in zip(key, embeddings, strict=True):
-                    self._cache.put(part, embedding)
+            for key, embedding in made.items():
+                self._cache.put(key, embedding)
         return [
-            item if item.crop is None else _Prepared(item.key, embeddings=made[item.key])
+            item if item.crop is None else _Prepared(item.key, embedding=made[item.key])
             for item in chunk
         ]
 
 
 @dataclass(frozen=True, eq=False)
 class _Prepared:
-    """One file: its crop, which is to be embedded, its embeddings, or why there is none."""
+    """One file: its crop, which is to be embedded, its embedding, or why there is none."""
 
-    key: tuple[bytes, ...] = field(repr=False)
+    key: bytes = field(repr=False)
     crop: NDArray[np.uint8] | None = field(default=None, repr=False)
-    embeddings: Embeddings = field(default=(), repr=False)
+    embedding: NDArray[np.float32] | None = field(default=None, repr=False)
     is_cached: bool = False
     failure: Failure | None = None

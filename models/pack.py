@@ -172,12 +172,6 @@ class ModelPack:
         """Embed aligned crops, RGB uint8 (B, s, s, 3), to unit rows, float32 (B, n)."""
         return self._embedder.embed(aligned, flip=self._embedder.preprocessing.flip)
 
-    def embed_both(
-        self, aligned: NDArray[np.uint8]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Embed aligned crops without and with the mirror image; see :meth:`embed`."""
-        return self._embedder.embed_both(aligned)
-
     def crop_photo(
         self,
         data: bytes,

@@ -1,6 +1,6 @@
 """From labelled embeddings to a contract: thresholds for stated false match rates."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,7 +26,7 @@ from verify.comparisons import Comparison, Lifter, Progress, honest_norms
 from verify.consistency import photo_consistency, suspicious_pairs
 from verify.group_rates import PeopleGroups, PhotoLabels, people_groups
 from verify.tenfold import random_pairs
-from verify.trials import ProbeSets, chosen_photos, enrolled_means, plan_trials
+from verify.trials import ProbeSets, enrolled_means, plan_trials
 
 SUSPICIOUS_ABOVE = 0.5
 """Raw cosine from which two people are reported as suspiciously alike. On LFW with ArcFace the
@@ -60,7 +60,6 @@ def calibrate(
     binding: Binding,
     source: DecoySource,
     options: CalibrationOptions | None = None,
-    exclude: Collection[str] = (),
     labels: PhotoLabels | None = None,  # of every embedding, for rates by group of people
     cohort_seed: bytes | None = None,  # a contract's, to keep its cohort
     recorded: Mapping[str, Json] | None = None,  # facts for the contract file
@@ -78,33 +77,23 @@ def calibrate(
     Raises
     ------
     ContractError
-        Where the data are too few for a single level, or do not fit the binding; where
-        ``worst_group`` is asked for and nobody is labelled.
-    ContractMismatch
-        Where ``source`` is not the binding's.
+        Where the data are too few for a single level, or ``worst_group`` is asked for and nobody
+        is labelled.
     """
     options = options or CalibrationOptions()
-    binding.require_source(source)
-    unit = unit_descriptors(embeddings)
-    if unit.shape != (len(identities), binding.n):
-        raise ContractError(
-            f"{len(identities)} identities and a binding of n = {binding.n} need embeddings of "
-            f"shape ({len(identities)}, {binding.n}), not {unit.shape}"
-        )
-    kept, names = chosen_photos(identities, exclude=exclude)
-    if len(set(names)) < 2:
+    data = np.ascontiguousarray(unit_descriptors(embeddings), dtype=np.float32)
+    if len(set(identities)) < 2:
         raise ContractError("a calibration needs at least two people")
-    data = np.ascontiguousarray(unit[kept], dtype=np.float32)
     rng = np.random.default_rng(options.seed)
     plan = plan_trials(
-        names,
+        identities,
         photos_per_enrollment=options.photos_per_enrollment,
         rng=rng,
         most_templates=None if labels is not None else options.most_templates,
     )
     groups: tuple[PeopleGroups, ...] = ()
     if labels is not None:
-        groups = people_groups(labels, kept, plan.person_of, people=len(plan.people))
+        groups = people_groups(labels, plan.person_of, people=len(plan.people))
     if options.worst_group and not groups:
         raise ContractError("thresholds by the worst group need labels of the people")
     pairs = None
@@ -151,7 +140,6 @@ def calibrate(
             "photos": len(data),
             "people": len(plan.people),
             "templates": len(plan.compared),
-            "excluded_photos": len(identities) - len(data),
             "photos_per_enrollment": options.photos_per_enrollment,
             "protocol": options.protocol,
             "seed": options.seed,

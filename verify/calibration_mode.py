@@ -24,7 +24,6 @@ from verify.thresholds import (
     TARGETS,
     Genuine,
     Impostors,
-    highest_scores,
     level_name,
     make_level,
     resolved_targets,
@@ -67,8 +66,6 @@ class CalibrationOptions:
     def __post_init__(self) -> None:
         for target in self.targets:
             level_name(target)  # refuses what has no name, before anything is computed
-        if 1 not in self.probe_photos:
-            raise ContractError("probes of one photo are always calibrated")
 
 
 @dataclass(frozen=True)
@@ -207,18 +204,11 @@ def _calibration(
             replace(level, groups=group_rates(level, run.groups, impostors, genuine))
             for level in levels
         ]
-    everything = len(run.plan.person_of) * (len(run.plan.people) - 1)
-    sample = f"{impostors.trials} of {everything} cross-identity pairs"
-    if probe_photos > 1:
-        sample = f"means of {probe_photos} photos of one person"
-    elif impostors.trials == everything:
-        sample = "all cross-identity pairs"
     facts: dict[str, Json] = {
         **run.facts,
         "genuine_trials": len(genuine.people),
         "impostor_trials": impostors.trials,
         "impostor_people_pairs": impostors.person_pairs,
-        "impostor_sample": sample,
     }
     if folds is not None:
         run.report.ten_folds.append(folds)
@@ -245,11 +235,10 @@ def _thresholds(
     run: CalibrationRun, impostors: Impostors, targets: Sequence[float]
 ) -> tuple[list[float], list[str]]:
     """Set a threshold for each target, the largest first; name the groups that are not heeded."""
-    highest = highest_scores(impostors, targets)
     thresholds: list[float] = []
     unheeded = []
     for target in targets:
-        threshold = threshold_at_fmr(highest, target, trials=impostors.trials)
+        threshold = threshold_at_fmr(impostors.scores, target, trials=impostors.trials)
         if run.options.worst_group:
             threshold, left_out = worst_group_threshold(threshold, target, run.groups, impostors)
             # A group that only laxer targets resolve must not make those the stricter levels.

@@ -16,20 +16,13 @@ from templates.space.subspace import SubspaceBatch
 Probes = NDArray[np.float32] | SubspaceBatch
 
 
-def cohort_statistics(
-    probes: SubspaceBatch, cohort: SubspaceBatch, *, metric: Metric, steps: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Mean and standard deviation of every lifted probe's similarities to the cohort, each (P,)."""
-    distances = pairwise_distances(probes, cohort, metric=metric, steps=steps)
-    similarities = np.asarray(similarity(distances), dtype=np.float64)
-    spread = np.maximum(similarities.std(axis=1, ddof=1), LEAST_SPREAD)
-    return similarities.mean(axis=1), spread
-
-
 def expected_similarity(
     probes: Probes, nobody: Nobody, *, metric: Metric, steps: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Mean and standard deviation that are expected of every probe, each (P,)."""
-    if isinstance(probes, SubspaceBatch):
-        return cohort_statistics(probes, nobody.cohort, metric=metric, steps=steps)
-    return nobody.statistics(probes, metric)
+    if not isinstance(probes, SubspaceBatch):
+        return nobody.statistics(probes, metric)
+    distances = pairwise_distances(probes, nobody.cohort, metric=metric, steps=steps)
+    similarities = np.asarray(similarity(distances), dtype=np.float64)
+    spread = np.maximum(similarities.std(axis=1, ddof=1), LEAST_SPREAD)
+    return similarities.mean(axis=1), spread

@@ -5,7 +5,7 @@ import hashlib
 import io
 from collections import Counter
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from templates.errors import VeilfaceError
@@ -30,6 +30,15 @@ class LabelledFolder:
 
     def __len__(self) -> int:
         return len(self.paths)
+
+    def without(self, people: Collection[str]) -> "LabelledFolder":
+        """Leave people out, by their names."""
+        kept = [place for place, name in enumerate(self.identities) if name not in people]
+        return replace(
+            self,
+            paths=tuple(self.paths[place] for place in kept),
+            identities=tuple(self.identities[place] for place in kept),
+        )
 
     @property
     def people(self) -> int:

@@ -73,17 +73,10 @@ def read_labels(file: Path) -> dict[Path, Label]:
 
 
 def _label(row: dict[str, str], *, where: str) -> Label:
-    if any(not row.get(name) for name in _NEEDED):
-        raise DatasetError(f"{where}: a cell is empty")
     if not row["file"].isprintable():
         raise DatasetError(f"{where}: the file has a name with characters that are not printable")
-    age = repaired_age(row["age"])
-    if age is None:
-        raise DatasetError(
-            f"{where}: the age is none of {', '.join(AGES)}, and no date that a spreadsheet makes "
-            "of one"
-        )
-    for name, known in (("gender", GENDERS), ("race", RACES)):
+    row["age"] = repaired_age(row["age"]) or row["age"]
+    for name, known in CLASSES.items():
         if row[name] not in known:
             raise DatasetError(f"{where}: the {name} is none of {', '.join(known)}")
-    return Label(age=age, gender=row["gender"], race=row["race"])
+    return Label(age=row["age"], gender=row["gender"], race=row["race"])

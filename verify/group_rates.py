@@ -62,19 +62,15 @@ class PeopleGroups:
 
 
 def people_groups(
-    labels: PhotoLabels, photos: Indices, person_of: Indices, *, people: int
+    labels: PhotoLabels, person_of: Indices, *, people: int
 ) -> tuple[PeopleGroups, ...]:
-    """Put people into groups; equal votes of their photos go to the group that comes first.
-
-    ``photos`` are the positions in the labels of those that are used, (N,), ``person_of`` theirs.
-    """
+    """Put people into groups; equal votes of their photos go to the group that comes first."""
     groups = []
     for attribute, column in labels.of.items():
-        own = [column[photo] for photo in photos]
-        names = sorted({label for label in own if label}, key=in_order)
+        names = sorted({label for label in column if label}, key=in_order)
         number = {name: place for place, name in enumerate(names)}
         votes = np.zeros((people, len(names)), dtype=np.int64)
-        for person, label in zip(person_of, own, strict=True):
+        for person, label in zip(person_of, column, strict=True):
             if label:
                 votes[person, number[label]] += 1
         if names:

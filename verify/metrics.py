@@ -7,7 +7,6 @@ rounding can move a score across its own threshold.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from statistics import NormalDist
 
 import numpy as np
@@ -63,13 +62,18 @@ def threshold_at_fmr(impostor: ArrayLike, target: float, *, trials: int | None =
 
     The threshold lies halfway between the last similarity that it accepts and the first that it
     rejects; above all of them where the target allows no error. ``trials`` counts them where
-    ``impostor`` holds only the highest similarities, more of them than the target allows errors.
+    ``impostor`` holds only the highest similarities, more of them than the target allows errors,
+    or cells that are no trials and hold minus infinity.
     """
-    scores = np.sort(np.asarray(impostor, dtype=np.float64).ravel())[::-1]
+    scores = np.asarray(impostor).ravel()
     if scores.size == 0 or not 0.0 <= target <= 1.0:
         raise ValueError("a threshold needs impostor trials and a target in [0, 1]")
     total = scores.size if trials is None else trials
     allowed = most_errors(target, total)
+    # Only the upper tail decides; sorting millions of scores in float64 would triple the memory.
+    if allowed + 2 < scores.size:
+        scores = np.partition(scores, scores.size - allowed - 2)[-allowed - 2 :]
+    scores = np.sort(scores.astype(np.float64))[::-1]
     if allowed == total:
         return float(scores[-1])
     if allowed >= scores.size:
@@ -92,33 +96,16 @@ def resolvable(target: float, trials: int, *, expected_errors: float = RULE_OF_T
     return target * trials >= expected_errors * (1 - 1e-9)
 
 
-@dataclass(frozen=True, repr=False)
-class ErrorCurve:
-    """FMR and FNMR at every threshold that changes either (the DET curve's points)."""
-
-    thresholds: Array64  # rising
-    fmr: Array64
-    fnmr: Array64
-
-
-def error_curve(genuine: ArrayLike, impostor: ArrayLike) -> ErrorCurve:
-    """Count both errors at every observed similarity and above the largest."""
-    genuine_sorted = np.sort(np.asarray(genuine, dtype=np.float64).ravel())
-    impostor_sorted = np.sort(np.asarray(impostor, dtype=np.float64).ravel())
-    if genuine_sorted.size == 0 or impostor_sorted.size == 0:
-        raise ValueError("an error curve needs genuine and impostor trials")
-    observed = np.unique(np.concatenate([genuine_sorted, impostor_sorted]))
+def equal_error_rate(genuine: ArrayLike, impostor: ArrayLike) -> float:
+    """EER: the mean of FMR and FNMR at the threshold where they are nearest to each other."""
+    own = np.sort(np.asarray(genuine, dtype=np.float64).ravel())
+    others = np.sort(np.asarray(impostor, dtype=np.float64).ravel())
+    observed = np.unique(np.concatenate([own, others]))
     thresholds = np.append(observed, np.nextafter(observed[-1], np.inf))
-    fmr = 1.0 - np.searchsorted(impostor_sorted, thresholds, side="left") / impostor_sorted.size
-    fnmr = np.searchsorted(genuine_sorted, thresholds, side="left") / genuine_sorted.size
-    return ErrorCurve(thresholds=thresholds, fmr=fmr, fnmr=fnmr)
-
-
-def equal_error_rate(genuine: ArrayLike, impostor: ArrayLike) -> tuple[float, float]:
-    """EER and its threshold: the mean of FMR and FNMR where they are nearest to each other."""
-    curve = error_curve(genuine, impostor)
-    nearest = int(np.argmin(np.abs(curve.fmr - curve.fnmr)))
-    return float(curve.fmr[nearest] + curve.fnmr[nearest]) / 2, float(curve.thresholds[nearest])
+    fmr = 1.0 - np.searchsorted(others, thresholds, side="left") / others.size
+    fnmr = np.searchsorted(own, thresholds, side="left") / own.size
+    nearest = int(np.argmin(np.abs(fmr - fnmr)))
+    return float(fmr[nearest] + fnmr[nearest]) / 2
 
 
 def subject_bootstrap(

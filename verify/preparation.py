@@ -17,7 +17,6 @@ from templates.errors import ContractMismatch, VeilfaceError
 from templates.keys.rotation import ROTATION_VERSION
 from templates.space.lifting import Strategy
 from verify.evaluation.attributes import resembling_rows
-from verify.own_decoys import SAME_PHOTO
 
 
 class PreparationError(VeilfaceError):
@@ -62,6 +61,8 @@ def require_made_with(source: DecoySource, pack: ModelPack) -> None:
         )
 
 
+SAME_PHOTO = 0.999
+"""Cosine of a photo to itself, encoded again."""
 LOOKALIKE = 0.75
 """Raw cosine from which on two photos that nobody labelled are taken for copies. Lower, it would
 drop strangers who look alike, of whom there are many among children, and flatter the thresholds."""

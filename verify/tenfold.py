@@ -58,8 +58,6 @@ def best_threshold(similarities: ArrayLike, same: ArrayLike) -> float:
     """
     scores = np.asarray(similarities, dtype=np.float64)
     truth = np.asarray(same, dtype=bool)
-    if scores.size == 0:
-        raise ValueError("a threshold needs at least one pair")
     order = np.argsort(-scores, kind="stable")
     ranked, genuine = scores[order], truth[order]
     # right[k]: correct decisions when the k highest are accepted.
@@ -83,8 +81,6 @@ def best_grid_threshold(similarities: ArrayLike, same: ArrayLike) -> float:
     """
     scores = np.asarray(similarities, dtype=np.float64)
     truth = np.asarray(same, dtype=bool)
-    if scores.size == 0:
-        raise ValueError("a threshold needs at least one pair")
     distances = 2 - 2 * scores
     genuine, impostor = np.sort(distances[truth]), np.sort(distances[~truth])
     right = np.searchsorted(genuine, GRID) + impostor.size - np.searchsorted(impostor, GRID)
@@ -98,8 +94,6 @@ def ten_fold(
     scores = np.asarray(similarities, dtype=np.float64)
     truth = np.asarray(same, dtype=np.bool_)
     numbers = np.asarray(folds, dtype=np.int64)
-    if not scores.shape == truth.shape == numbers.shape:
-        raise ValueError("the protocol needs one similarity, one truth and one fold for each pair")
     accuracies, thresholds = [], []
     for fold in range(FOLDS):
         held_out = numbers == fold

@@ -143,16 +143,6 @@ def bound_when_set_anew(impostors: Impostors, target: float) -> float:
     return float(np.quantile(rates, 0.95))
 
 
-def highest_scores(impostors: Impostors, targets: Sequence[float]) -> Scores:
-    """Return the scores that thresholds for these targets, or lower ones, are set by."""
-    count = most_errors(max(targets, default=0.0), impostors.trials) + 2
-    scores = impostors.scores
-    if count >= len(scores):
-        return scores[np.isfinite(scores)]
-    tail = np.partition(scores, len(scores) - count)[-count:]
-    return tail[np.isfinite(tail)]
-
-
 def make_level(
     name: str,
     target: float | None,

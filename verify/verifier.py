@@ -12,7 +12,7 @@ from templates.contract import wire
 from templates.contract.document import Calibration, Contract, Level
 from templates.decoys import DecoySource
 from templates.distances import paired_distances, similarity
-from templates.errors import ContractMismatch, InvalidTemplate
+from templates.errors import InvalidTemplate
 from templates.keys.randomness import KEY_BYTES
 from templates.keys.rotation import HolderKey, TenantRotation, holder_rotation
 from templates.space.embedding import unit_rows
@@ -53,24 +53,14 @@ class Verifier:
     Parameters
     ----------
     source
-        The contract's decoys, reduced to its axes.
+        The contract's decoys, reduced to its axes. ContractMismatch where they are others.
     rotation
         What gives each template of the tenant its rotation.
-
-    Raises
-    ------
-    ContractMismatch
-        Where the decoys are others, or the rotation is of another dimension.
     """
 
     def __init__(
         self, contract: Contract, source: DecoySource, *, rotation: TenantRotation
     ) -> None:
-        axes = contract.binding.axes
-        if rotation.n != axes:
-            raise ContractMismatch(
-                f"templates of the contract have {axes} numbers, the rotation turns {rotation.n}"
-            )
         self._contract = contract
         self._source = source
         self._nobody = contract.nobody(source)
@@ -86,7 +76,7 @@ class Verifier:
         level: str | None = None,
         photos: int = 1,
     ) -> Decision:
-        """Decide for a unit-norm embedding, (n,).
+        """Decide for a unit-norm embedding, (n,), the normalised mean of so many photos.
 
         Parameters
         ----------
@@ -96,10 +86,6 @@ class Verifier:
         holder_key
             The 32 bytes that its holder keeps. A template that needs a key accepts nobody without
             it; one that needs none ignores what is sent.
-        level
-            Name of a level; the contract's default where None.
-        photos
-            Photos of one person that the embedding is the normalised mean of.
 
         Raises
         ------
@@ -130,16 +116,8 @@ class Verifier:
     ) -> Decision:
         """Decide for a probe that the client lifted, in the wire format, un-rotated.
 
-        Parameters as in ``decide_embedding``.
-
-        Raises
-        ------
-        InvalidTemplate
-            Where the probe's bytes break the format, or its foot point cannot be an honest lift's.
-        Uncalibrated
-            Where the contract has no calibration for the probe's dimension.
-        ContractMismatch
-            Where the probe belongs to another contract.
+        As ``decide_embedding``. InvalidTemplate also where the probe's foot point cannot be an
+        honest lift's, Uncalibrated where nothing is calibrated for the probe's dimension.
         """
         binding = self._contract.binding
         received = wire.decode(probe)

@@ -29,6 +29,7 @@ from attacks.attributes.audit import (
     labelled_faces,
     run_attribute_audit,
 )
+from attacks.attributes.neighbours import K
 from attacks.attributes.plan import OUR_DIMS, PAPER_DIMS, AttributePlan, schemes_of
 from attacks.outcomes import GENERATED, RAW, Scheme
 from attacks.report import document
@@ -187,7 +188,7 @@ def fairface(
             "lifting": len(parts.lifting),
             "attack": len(parts.attack),
             "attacked": len(parts.attacked),
-            "k": plan.k,
+            "k": K,
             "decoys": "of the lifting faces" if generator is None else generator.source_id,
             "audited": str(audited),
             "flip": flip,

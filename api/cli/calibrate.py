@@ -159,11 +159,11 @@ def calibrate(
     if worst_group and labels is None:
         raise UsageError("--worst-group needs to know the groups: give --labels")
     known = None if labels is None else read_labels(labels)
-    labelled = people_or_faces(folder)
+    exclude = frozenset() if exclude_people is None else read_names(exclude_people)
+    labelled = people_or_faces(folder).without(exclude)
     keyring = open_keyring(settings)
     sealer = file_sealer(keyring)
     source = load_decoys(decoys or settings.resolved_decoys_file, sealer, pack)
-    exclude = frozenset() if exclude_people is None else read_names(exclude_people)
     extraction = extract(pack, labelled.paths, aligned=aligned, settings=settings, cache=cache)
     if labelled.people == len(labelled):
         extraction = each_person_once(extraction)
@@ -185,7 +185,6 @@ def calibrate(
                 worst_group=worst_group,
                 seed=seed,
             ),
-            exclude=exclude,
             labels=groups,
             progress=lambda _what, share: report(share),
         )

@@ -4,7 +4,7 @@ Axes and dimension are chosen, and privacy is judged, by attacks; so this lies a
 ``verify`` and ``attacks``. The commands ``calibrate`` and ``setup``, and the demo, call it.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,7 +30,6 @@ from verify.comparisons import Progress
 from verify.group_rates import PhotoLabels
 from verify.own_decoys import require_others
 from verify.preparation import PreparationError, binding_for, recorded_of
-from verify.trials import chosen_photos
 
 DEFAULT_PROBE_DIM = 4
 """Dimension of the lifted probes that a calibration takes."""
@@ -62,7 +61,6 @@ def calibrate_folder(
     axes: int | None = None,
     m: int | None = None,
     options: CalibrationOptions,
-    exclude: Collection[str] = (),
     labels: PhotoLabels | None = None,
     progress: Progress = lambda _what, _share: None,
 ) -> CalibratedFolder:
@@ -78,15 +76,14 @@ def calibrate_folder(
         )
     name_of = dict(zip(folder.paths, folder.identities, strict=True))
     names = [name_of[path] for path in extraction.paths]
-    kept, staying = chosen_photos(names, exclude=exclude)
-    if len(kept):
-        require_others(source, extraction.embeddings[kept], staying)
+    if names:
+        require_others(source, extraction.embeddings, names)
     # Thousands of products of small matrices: with a second thread for each, the library spends
     # most of its time waiting. The distances have threads of their own.
     with single_threaded():
         point = operating_point(
-            extraction.embeddings[kept],
-            staying,
+            extraction.embeddings,
+            names,
             source,
             strategy=strategy,
             axes=axes,
@@ -102,14 +99,13 @@ def calibrate_folder(
             binding=binding_for(pack, source, strategy=strategy, m=point.dim),
             source=source,
             options=replace(options, probe_dims=probe_dims),
-            exclude=exclude,
             labels=labels,
             recorded=recorded_of(pack),
             dataset=folder.root.resolve().name,
             progress=part_of(progress, SEARCHED, 1.0),
         )
     accuracy = None
-    if len(set(staying)) < len(staying):
+    if len(set(names)) < len(names):
         accuracy = judge_accuracy(
             done.contract, photos=extraction.attempts, not_acquired=len(extraction.failures)
         )

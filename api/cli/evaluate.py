@@ -14,7 +14,6 @@ from api.cli.evaluation_inputs import (
     open_all,
     open_embedder,
     open_sources,
-    wants_raw_flip,
 )
 from api.cli.evaluation_report import write_results
 from api.cli.inputs import listed, named_file
@@ -154,13 +153,12 @@ def evaluate(
     names = None
     if strategy is not None:
         names = listed(strategy, str, "--strategy", expected="names of strategies")
-    raw_flip = wants_raw_flip(names, embeddings, flip=flip)
-    embedder = open_embedder(settings, embeddings, flip=flip, raw_flip=raw_flip, aligned=aligned)
+    embedder = open_embedder(settings, embeddings, flip=flip, aligned=aligned)
     sources = open_sources(decoys or [], settings, embedder, axes=axes)
     decoy_sources = [facts.source for facts in sources]
     try:
         plan = EvaluationPlan(
-            strategies=names or default_strategies(decoy_sources, raw_flip=raw_flip),
+            strategies=names or default_strategies(decoy_sources),
             dims=listed(dim, int, "--dim", expected="whole numbers such as 2,4"),
             modes=listed(mode, _mode, "--mode", expected=f"a list of {', '.join(LIFTED_MODES)}"),
             metrics=listed(metric, Metric, "--metric", expected=f"a list of {', '.join(Metric)}"),
@@ -169,7 +167,7 @@ def evaluate(
             seed=seed,
             targets=tuple(sorted(_rates(fmr), reverse=True)),
         )
-        units_of(plan, decoy_sources, n=embedder.model.n)
+        units_of(plan, decoy_sources, n=embedder.model["n"])
     except EvaluationError as error:
         raise UsageError(str(error)) from None
     known = None if labels is None else read_labels(labels)

@@ -20,7 +20,6 @@ from templates.contract.document import Contract
 from verify.datasets import DatasetError
 from verify.evaluation.liveness.document import (
     CONTRACT_POINT,
-    OperatingPoint,
     document,
     markdown,
     row_cells,
@@ -29,7 +28,7 @@ from verify.evaluation.liveness.presentations import PresentationSet, read_prese
 from verify.evaluation.liveness.rates import threshold_at_bpcer
 from verify.evaluation.liveness.scores import ScoredSet, VerifiedSet, score_set
 from verify.evaluation.plan import Json
-from verify.evaluation.provenance import Model
+from verify.evaluation.provenance import model_facts
 from verify.preparation import recorded_of
 
 
@@ -99,7 +98,7 @@ def evaluate_liveness(
     verified, unverified = _verified(scored, pack, bound, settings, decoys=decoys, level=level)
     results = document(
         scored,
-        Model(pack.info.n, recorded_of(pack), pack.info.embedder_sha256, pack.info.preprocessing),
+        model_facts(pack.info, recorded_of(pack)),
         liveness,
         points,
         contract=bound,
@@ -153,21 +152,20 @@ def require_responses(scored: ScoredSet) -> None:
 
 def _points(
     scored: ScoredSet, contract: Contract | None, targets: tuple[float, ...]
-) -> tuple[list[OperatingPoint], list[str]]:
-    points, refused = [], []
+) -> tuple[dict[str, float], list[str]]:
+    points: dict[str, float] = {}
+    refused = []
     if contract is not None and contract.liveness is not None:
-        points.append(OperatingPoint(CONTRACT_POINT, contract.liveness.threshold))
+        points[CONTRACT_POINT] = contract.liveness.threshold
     elif contract is not None:
         refused.append(
             "the contract has no liveness threshold; `veilface calibrate --liveness` sets one"
         )
     for target in sorted(set(targets)):
         try:
-            threshold = threshold_at_bpcer(scored.scored(None), target)
+            points[f"bpcer-{target:g}"] = threshold_at_bpcer(scored.scored(None), target)
         except DatasetError as error:
             refused.append(str(error))
-        else:
-            points.append(OperatingPoint(f"bpcer-{target:g}", threshold))
     if not points:
         raise CommandError(f"no threshold to report at: {'; '.join(refused)}")
     return points, refused

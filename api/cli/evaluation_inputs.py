@@ -13,7 +13,6 @@ from templates.decoys import DecoyGenerator, DecoyPool, load_source
 from templates.decoys.pool import POOL_MAGIC
 from verify.evaluation.embedding import Embedder, FileEmbedder, PackEmbedder
 from verify.evaluation.embeddings_file import read_embeddings
-from verify.evaluation.plan import RAW_FLIP
 from verify.evaluation.readers import open_sets
 from verify.evaluation.sources import SourceFacts
 from verify.evaluation.verification_set import VerificationSet
@@ -34,26 +33,11 @@ def open_all(datasets: Sequence[Path], *, pictures: bool) -> list[VerificationSe
     return sets
 
 
-def wants_raw_flip(
-    strategies: tuple[str, ...] | None, embeddings: Path | None, *, flip: bool
-) -> bool:
-    """Whether raw embeddings with the mirror image are compared beside the others."""
-    if strategies is None:
-        return embeddings is None and not flip
-    if RAW_FLIP in strategies and (embeddings is not None or flip):
-        raise UsageError(
-            f"{RAW_FLIP} is raw embeddings with the mirror image added, beside raw ones without: "
-            "it needs a pack, and no --flip"
-        )
-    return RAW_FLIP in strategies
-
-
 def open_embedder(
     settings: Settings,
     embeddings: Path | None,
     *,
     flip: bool,
-    raw_flip: bool,
     aligned: bool | None,
 ) -> Embedder:
     """Open the pack or the file of embeddings."""
@@ -66,7 +50,6 @@ def open_embedder(
         return PackEmbedder(
             pack,
             recorded_of(pack),
-            mirrored=raw_flip,
             aligned=aligned,
         )
     if not no_pack:
@@ -94,10 +77,10 @@ def open_sources(
         )
         if axes is not None and not is_pool:
             source = source.reduced(axes)
-        if source.n != embedder.model.n:
+        if source.n != embedder.model["n"]:
             raise CommandError(
                 f"{file.name} has decoys of {source.n} numbers each, the embeddings have "
-                f"{embedder.model.n}; build the decoys with this pack"
+                f"{embedder.model['n']}; build the decoys with this pack"
             )
         if isinstance(embedder, PackEmbedder):
             require_made_with(source, embedder.pack)

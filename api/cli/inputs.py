@@ -17,7 +17,7 @@ T = TypeVar("T")
 
 
 def listed(text: str, kind: Callable[[str], T], option: str, *, expected: str) -> tuple[T, ...]:
-    """Read a list with commas.
+    """Read a list with commas, each entry once.
 
     Parameters
     ----------
@@ -31,7 +31,7 @@ def listed(text: str, kind: Callable[[str], T], option: str, *, expected: str) -
     """
     parts = [part.strip() for part in text.split(",") if part.strip()]
     try:
-        values = tuple(kind(part) for part in parts)
+        values = tuple(dict.fromkeys(kind(part) for part in parts))
     except ValueError:
         raise UsageError(f"{option} takes {expected}, not {text!r}") from None
     if not values:
@@ -59,9 +59,7 @@ def fairface_labels(root: Path, part: str) -> dict[Path, Label]:
 
 def listed_dims(text: str, option: str, *, n: int, example: str) -> tuple[int, ...]:
     """Read dimensions m of subspaces of Rⁿ, each once."""
-    dims = tuple(
-        dict.fromkeys(listed(text, int, option, expected=f"whole numbers such as {example}"))
-    )
+    dims = listed(text, int, option, expected=f"whole numbers such as {example}")
     wrong = [m for m in dims if not 1 <= m < n]
     if wrong:
         raise UsageError(f"{option} takes dimensions from 1 to {n - 1}, not {wrong[0]}")
@@ -77,7 +75,7 @@ def listed_numbers(
         if number < least or (most is not None and number > most):
             taken = f"from {least}" + ("" if most is None else f" to {most}")
             raise UsageError(f"{option} takes numbers {taken}, not {number}")
-    return tuple(dict.fromkeys(numbers))
+    return numbers
 
 
 def named_file(file: Path | None) -> dict[str, Json] | None:

@@ -41,8 +41,7 @@ from templates.store.api_keys import Right
 from verify import CalibrationOptions, LabelledFolder
 from verify.datasets import visible
 from verify.evaluation.attributes import resembling_rows
-from verify.own_decoys import SAME_PHOTO
-from verify.preparation import acquired, make_generator
+from verify.preparation import SAME_PHOTO, acquired, make_generator
 
 RIGHTS = (Right.ENROLL, Right.VERIFY, Right.ERASE, Right.SCORES, Right.ADMIN)
 """Of the key that is made: all that the page shows, with distances, locks and the audit log."""

@@ -6,17 +6,18 @@ part in the axes or in the gallery that it is judged by. The generator it has.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from attacks.attributes.faces import LabelledFaces
-from attacks.attributes.features import features_of
-from attacks.attributes.neighbours import METRICS, Attacked, nearest_neighbours, vote
+from attacks.attributes.features import MOST_NEIGHBOURS, features_of
+from attacks.attributes.neighbours import METRICS, Attacked, K, nearest_neighbours, vote
 from attacks.attributes.plan import Setup, Side
 from attacks.attributes.rows import AttributeRow, measure
-from attacks.outcomes import GENERATED, POOLED, RAW_SCHEME, AuditError, KnowledgeLevel, Scheme
+from attacks.outcomes import GENERATED, POOLED, RAW_SCHEME, KnowledgeLevel, Scheme
 from attacks.second_order import likeliest_embeddings
 from attacks.stored.known_pool import find_decoys, strip
 from templates.keys.randomness import Keystream
@@ -39,53 +40,37 @@ _LOGISTIC_CS = (1e-4, 1e-3, 1e-2, 1e-1)
 
 
 def run_scheme(setup: Setup, scheme: Scheme) -> list[AttributeRow]:
-    """Attack one scheme with every attacker of the plan, for every attribute.
+    """Attack one scheme with every attacker, for every attribute.
 
-    Parameters
-    ----------
-    scheme
-        Raw embeddings, or a strategy with the pool of the lifting faces or the generator. hybrid+
-        lifts the attacked faces by their true labels, as the paper does.
-
-    Returns
-    -------
-    list of AttributeRow
-        The paper's attacker by both metrics (raw: by one, as they agree), the trained attackers,
-        and for pools those that hold the pool.
+    These are the paper's attacker by both metrics (of raw embeddings by one, as they agree), the
+    trained attackers, and for pools those that hold the pool. hybrid+ lifts the attacked faces by
+    their true labels, as the paper does.
 
     Raises
     ------
-    AuditError
-        The scheme cannot be run on these faces.
     LiftingError, DecoyError
         There are too few decoys for the scheme.
     """
-    plan, attack = setup.plan, setup.split.attack
+    attack = setup.split.attack
     own, held_out = observe_own(setup, scheme)
     attacked = observe_attacked(setup, scheme)
-    training, choosing = ({key: part[~held_out] for key, part in own.items()},
-                          {key: part[held_out] for key, part in own.items()})  # fmt: skip
+    training = {key: part[~held_out] for key, part in own.items()}
+    choosing = {key: part[held_out] for key, part in own.items()}
+
+    def row(
+        attribute: str, said: Codes, at_home: Codes, truth_at_home: Codes, **names: Any
+    ) -> AttributeRow:
+        names |= {"scheme": scheme, "attribute": attribute, "seed": setup.plan.seed}
+        names["classes"] = attack.classes[attribute]
+        strength = measure(at_home, truth_at_home, **names).strength
+        return replace(measure(said, attacked["truth", attribute], **names), held_out=strength)
+
     rows: list[AttributeRow] = []
-
-    def add(
-        attacker: str, metric: str | None, known: KnowledgeLevel, attribute: str,
-        said: Codes, said_at_home: Codes, truth_at_home: Codes,
-    ) -> None:  # fmt: skip
-        classes = attack.classes[attribute]
-
-        def against(predicted: Codes, truth: Codes) -> AttributeRow:
-            return measure(
-                predicted, truth, scheme=scheme, attribute=attribute, attacker=attacker,
-                metric=metric, knowledge=known, classes=classes, seed=plan.seed,
-            )  # fmt: skip
-
-        row = against(said, attacked["truth", attribute])
-        rows.append(row.chosen_by(against(said_at_home, truth_at_home)))
-
     for name, metric, attribute in (key for key in attacked if key[0] == "vote"):
         # The vote learns from no template, so that all of the attacker's own try it.
         key, truth = (name, metric, attribute), own["truth", attribute]
-        add(KNN, metric, KnowledgeLevel.ALGORITHM, attribute, attacked[key], own[key], truth)
+        names = {"attacker": KNN, "metric": metric, "knowledge": KnowledgeLevel.ALGORITHM}
+        rows.append(row(attribute, attacked[key], own[key], truth, **names))
     trained: list[tuple[str, KnowledgeLevel, list[tuple[str, ...]]]] = [
         (LOGISTIC, KnowledgeLevel.ALGORITHM, [("features",)])
     ]
@@ -97,7 +82,8 @@ def run_scheme(setup: Setup, scheme: Scheme) -> list[AttributeRow]:
     for name, known, alternatives in trained:
         for attribute in attack.classes:
             said = trained_on(training, choosing, attacked, attribute, alternatives)
-            add(name, None, known, attribute, *said, choosing["truth", attribute])
+            truth = choosing["truth", attribute]
+            rows.append(row(attribute, *said, truth, attacker=name, metric=None, knowledge=known))
     return rows
 
 
@@ -110,17 +96,9 @@ def trained_on(
 ) -> tuple[Codes, Codes]:
     """Train a logistic regression on templates that the attacker lifted itself.
 
-    Parameters
-    ----------
-    choosing
-        Templates that the attacker lifted, and does not learn from: it chooses the regularisation
-        and the features by them.
-    alternatives
-        The names of the parts that are learnt from together, each a choice.
-
-    Returns
-    -------
-    Predictions of the attacked faces, and of those that were chosen by.
+    It chooses the regularisation, and one of the ``alternatives`` of parts to learn from, by
+    templates that it does not learn from (``choosing``). Returns predictions of the attacked faces,
+    and of those that were chosen by.
     """
     # Imported here: only an audit of attributes needs the library.
     from sklearn.linear_model import LogisticRegression
@@ -217,10 +195,6 @@ def _lifted(
     if scheme == RAW_SCHEME:
         return faces.embeddings
     attributes = faces.decoy_attributes() if scheme.strategy == Strategy.HYBRID_PLUS else None
-    if scheme.strategy == Strategy.HYBRID_PLUS and attributes is None:
-        raise AuditError("hybrid+ chooses decoys by gender and race: give labels of both")
-    if scheme.decoys == GENERATED and setup.generator is None:
-        raise AuditError("schemes with generated decoys need a decoy generator")
     return lift(
         faces.embeddings,
         strategy=scheme.strategy,
@@ -239,23 +213,24 @@ def _look(
     voters: LabelledFaces,
     own: Codes | None,
 ) -> Observed:
-    plan, ks = setup.plan, setup.plan.feature_ks
     metrics = METRICS if scheme != RAW_SCHEME else METRICS[:1]
-    near = nearest_neighbours(attacked, side.nearby.embeddings, k=plan.neighbours, metrics=metrics)
-    features = features_of(attacked, side.axes, near, side.nearby, ks=ks)
+    near = nearest_neighbours(attacked, side.nearby.embeddings, k=MOST_NEIGHBOURS, metrics=metrics)
+    features = features_of(attacked, side.axes, near, side.nearby)
     if len(voters) > len(side.nearby):
-        near = nearest_neighbours(attacked, voters.embeddings, k=plan.k, metrics=metrics)
+        near = nearest_neighbours(attacked, voters.embeddings, k=K, metrics=metrics)
     seen: Observed = {("features",): features}
     seen |= {
-        ("vote", str(metric), name): vote(near[metric], voters.labels[name], len(of), k=plan.k)
+        ("vote", str(metric), name): vote(near[metric], voters.labels[name], len(of), k=K)
         for metric in metrics
         for name, of in voters.classes.items()
     }
     if scheme.decoys is None or not isinstance(attacked, SubspaceBatch):
         return seen
     points = _guess(setup, scheme, side, attacked, own)
-    near = nearest_neighbours(points, side.nearby.embeddings, k=max(ks), metrics=METRICS[:1])
-    guessed = features_of(points, side.axes, near, side.nearby, ks=ks)
+    near = nearest_neighbours(
+        points, side.nearby.embeddings, k=MOST_NEIGHBOURS, metrics=METRICS[:1]
+    )
+    guessed = features_of(points, side.axes, near, side.nearby)
     if scheme.decoys == GENERATED:
         guessed = np.hstack([guessed, features])
     return seen | {("points",): points, ("guessed",): guessed}

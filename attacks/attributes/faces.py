@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from attacks.outcomes import AuditError
 from templates.decoys.source import Attributes, DecoySource
-from templates.space.embedding import unit_descriptors
 
 Array32 = NDArray[np.float32]
 Codes = NDArray[np.int64]
@@ -27,19 +26,11 @@ class LabelledFaces:
     classes
         By attribute: the names of the classes, at least two.
 
-    Raises
-    ------
-    InvalidEmbedding
-        A row is not a finite unit vector.
     """
 
     embeddings: Array32
     labels: Mapping[str, Codes]
     classes: Mapping[str, tuple[str, ...]]
-
-    def __post_init__(self) -> None:
-        rows = np.ascontiguousarray(unit_descriptors(self.embeddings), dtype=np.float32)
-        object.__setattr__(self, "embeddings", rows)
 
     def __len__(self) -> int:
         return len(self.embeddings)
@@ -72,10 +63,8 @@ class LabelledFaces:
         """Take the embeddings to the coordinates that templates have."""
         return LabelledFaces(source.project(self.embeddings), self.labels, self.classes)
 
-    def decoy_attributes(self) -> list[Attributes] | None:
-        """Gender and race of every face, as hybrid+ needs them; None without labels of both."""
-        if not {"gender", "race"} <= self.classes.keys():
-            return None
+    def decoy_attributes(self) -> list[Attributes]:
+        """Gender and race of every face, as hybrid+ needs them."""
         genders, races = (
             [self.classes[name][code] for code in self.labels[name].tolist()]
             for name in ("gender", "race")

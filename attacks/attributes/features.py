@@ -6,7 +6,7 @@ affine hull of k + 1 faces; p is close to their mean, so a linear score of p is 
 faces' scores, and x DᵀD y measures how the scores x and y spread over them.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,6 +24,9 @@ Codes = NDArray[np.int64]
 # Shrinkage of the within-class covariance towards a multiple of the identity: measured on FairFace,
 # accuracies differ by less than a point from 0.1 to 0.5.
 _SHRINKAGE = 0.3
+SHARES_AMONG = (10, 50)
+"""Neighbours whose classes' shares the trained attackers see."""
+MOST_NEIGHBOURS = max(SHARES_AMONG)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -80,8 +83,6 @@ def features_of(
     axes: Axes,
     neighbours: Mapping[Metric, Neighbours],
     gallery: LabelledFaces,
-    *,
-    ks: Sequence[int],
 ) -> Array32:
     """Compute the features (P, f) float32 of templates, or of raw embeddings.
 
@@ -91,7 +92,7 @@ def features_of(
     axes
         Found on faces that are in none of these templates, or their scores would be too sure.
     neighbours
-        Of ``attacked`` in the gallery, as many as the largest of ``ks`` or more.
+        Of ``attacked`` in the gallery, ``MOST_NEIGHBOURS`` or more.
     gallery
         Labelled faces that are in none of these templates.
 
@@ -99,13 +100,14 @@ def features_of(
     -----
     For discriminants w and prototypes μ: w·p, and wᵢ DᵀD wⱼ for every pair; ‖p‖; the similarity of
     the set to every prototype, p·μ + s‖Dμ‖, and s‖Dw‖; the shares of the classes among the
-    neighbours, by metric, attribute and K. Of a raw embedding, which has no D, those that are left.
+    neighbours, by metric, attribute and ``SHARES_AMONG``. Of a raw embedding, which has no D, those
+    that are left.
     """
     shares = [
         votes(near, gallery.labels[attribute], len(names), k=k)
         for near in neighbours.values()
         for attribute, names in gallery.classes.items()
-        for k in ks
+        for k in SHARES_AMONG
     ]
     if not isinstance(attacked, SubspaceBatch):
         parts = [attacked @ axes.discriminants.T, attacked @ axes.prototypes.T]

@@ -21,7 +21,6 @@ from verify.evaluation.figures.style import (
     name_groups,
     panels,
 )
-from verify.evaluation.row_labels import order_of
 
 Row = Mapping[str, Any]
 
@@ -56,7 +55,7 @@ def attribute_figure(rows: Sequence[Row]) -> Figure | None:
     bars = {(row["attribute"], Scheme.of(row)): row for row in papers}
     if not bars:
         return None
-    places, names = _layout(sorted(bars.values(), key=_order))
+    places, names = _layout(bars.values())
     marks: dict[tuple[str, Scheme, str], Row] = {}
     for row in rows:
         key = (row["attribute"], Scheme.of(row), row["knowledge"])
@@ -104,11 +103,6 @@ def attribute_figure(rows: Sequence[Row]) -> Figure | None:
             ncols=2,
         )
     return figure
-
-
-def _order(row: Row) -> tuple[Any, ...]:
-    # The paper's strategies with its pool first, generated decoys last.
-    return row["decoys"] == "generator", order_of({"mode": "", **row})
 
 
 def _layout(rows: Iterable[Row]) -> tuple[dict[Scheme, float], list[tuple[str, float]]]:

@@ -5,7 +5,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from attacks.outcomes import AuditError
 from templates.distances import Metric, Neighbours, nearest
 from templates.space.subspace import SubspaceBatch
 
@@ -15,6 +14,8 @@ Attacked = Array32 | SubspaceBatch
 """Raw embeddings (P, n), or templates of P faces."""
 
 METRICS = (Metric.EUCLIDEAN, Metric.SPHERICAL)
+K = 10
+"""Neighbours of the paper's attacker."""
 _TIE = 1e-4
 """Of the vote: all that it adds together weighs less than one neighbour."""
 
@@ -22,30 +23,11 @@ _TIE = 1e-4
 def nearest_neighbours(
     attacked: Attacked, gallery: Array32, *, k: int, metrics: Sequence[Metric] = METRICS
 ) -> Mapping[Metric, Neighbours]:
-    """Search the gallery for the K faces that are nearest to each template.
+    """Search the gallery, (G, n), for the k faces nearest to each template: by metric, (P, k).
 
-    Parameters
-    ----------
-    attacked : (P, n) float32 or SubspaceBatch of P
-        Of raw embeddings both metrics are the distance of two points.
-    gallery : (G, n) float32
-        Unit rows.
-
-    Returns
-    -------
-    By metric, of shape (P, K).
-
-    Raises
-    ------
-    AuditError
-        ``k`` is more than G, or less than 1.
-
-    References
-    ----------
-    Paper eq. 1; docs/method.md §3.1.
+    Of raw embeddings both metrics are the distance of two points (paper eq. 1, docs/method.md
+    §3.1).
     """
-    if not 1 <= k <= len(gallery):
-        raise AuditError(f"{k} neighbours cannot be found among {len(gallery)} faces")
     if isinstance(attacked, SubspaceBatch):
         return {metric: nearest(gallery, attacked, k=k, metric=metric) for metric in metrics}
     # Imported here: only an audit of attributes needs the library.
@@ -58,15 +40,7 @@ def nearest_neighbours(
 
 
 def votes(neighbours: Neighbours, labels: Codes, classes: int, *, k: int) -> Array32:
-    """Share of the k nearest neighbours in each class, (P, classes) float32.
-
-    Parameters
-    ----------
-    neighbours
-        With K ≥ k.
-    labels : (G,) int64
-        Class numbers of the gallery.
-    """
+    """Share of the k nearest neighbours in each class, (P, classes); ``labels`` are (G,)."""
     of = labels[neighbours.indices[:, :k]]
     shares = [(of == code).mean(axis=1) for code in range(classes)]
     return np.stack(shares, axis=1).astype(np.float32)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attacks.attributes.faces import LabelledFaces, Split
-from attacks.attributes.features import Axes
+from attacks.attributes.features import MOST_NEIGHBOURS, Axes
 from attacks.outcomes import GENERATED, POOLED, RAW_SCHEME, AuditError, Scheme
 from attacks.second_order import Moments, decoy_moment, drawn_towards
 from templates.decoys import DecoyGenerator, DecoyPool
@@ -42,8 +42,6 @@ class AttributePlan:
         None for all.
     axes
         That faces are projected on for generated decoys; None for all.
-    k, feature_ks
-        Neighbours of the paper's attacker, and those whose shares the trained ones see.
     training_most
         Most templates that the attacker lifts to train on. Each of its faces is lifted up to three
         times: labels are scarce, and lifting is free.
@@ -59,15 +57,8 @@ class AttributePlan:
     attacked: int | None = None
     axes: int | None = None
     seed: int = 0
-    k: int = 10
-    feature_ks: tuple[int, ...] = (10, 50)
     training_most: int = 10_000
     gallery_most: int = 10_000
-
-    @property
-    def neighbours(self) -> int:
-        """How many are searched for."""
-        return max(self.k, *self.feature_ks)
 
     def lifts_of(self, faces: int) -> int:
         """Times that each of so many own faces is lifted."""
@@ -102,7 +93,18 @@ class AttributePlan:
                 f"{self.lifting} lifting faces and {self.attack or 'the others'} for the attacker "
                 f"cannot be taken from {training} training faces: choose smaller sizes"
             )
-        require_folds(faces, self)
+        gallery = min(faces - -(-faces // FOLDS), self.gallery_most)
+        if gallery < MOST_NEIGHBOURS:
+            raise AuditError(
+                f"the attacker's {faces} faces leave {gallery} in the gallery of a fold, and "
+                f"{MOST_NEIGHBOURS} neighbours are searched for: give the attacker more faces"
+            )
+        own = min(faces, self.training_most) // FOLDS
+        if not 0 < round(HELD_OUT * own) < own:
+            raise AuditError(
+                f"a fold of {own} faces is too small to hold some of them out: give the attacker "
+                "more faces"
+            )
         # The own faces of a fold are its pool. Where one of them is drawn for itself, all of its
         # decoys are drawn once more: of more than half of the pool that would hardly end.
         pool = min(self.lifting, faces // FOLDS // 2)
@@ -123,29 +125,6 @@ def _sample(labels: Mapping[Path, Label], most: int | None, seed: int) -> Mappin
     photos = list(labels)
     chosen = np.random.default_rng([seed, 3]).permutation(len(photos))[:most]
     return {photos[index]: labels[photos[index]] for index in sorted(chosen.tolist())}
-
-
-def require_folds(faces: int, plan: AttributePlan) -> None:
-    """Check that so many faces of the attacker's can be dealt into folds.
-
-    Raises
-    ------
-    AuditError
-        Too few are in the gallery of a fold for the neighbours of the plan, or in a fold to hold
-        some of them out.
-    """
-    least = min(faces - -(-faces // FOLDS), plan.gallery_most)
-    if least < plan.neighbours:
-        raise AuditError(
-            f"the attacker's {faces} faces leave {least} in the gallery of a fold, and "
-            f"{plan.neighbours} neighbours are searched for: give the attacker more faces"
-        )
-    own = min(faces, plan.training_most) // FOLDS
-    if not 0 < round(HELD_OUT * own) < own:
-        raise AuditError(
-            f"a fold of {own} faces is too small to hold some of them out: give the attacker more "
-            "faces"
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,22 +209,9 @@ class Setup:
 
 
 def prepare(parts: Split, *, plan: AttributePlan, generator: DecoyGenerator | None = None) -> Setup:
-    """Find what all schemes share.
-
-    Parameters
-    ----------
-    generator
-        The one of the deployment that is audited, which clients have, on the axes that the faces
-        are projected on. Without one, schemes with generated decoys cannot be run.
-
-    Raises
-    ------
-    AuditError
-        The attacker has too few faces for the plan.
-    """
+    """Find what all schemes share; the generator is on the axes that the faces are projected on."""
     decoys = None if generator is None else Moments.of(decoy_moment(generator))
     side_of = partial(Side.of, nearby=plan.gallery_most, decoys=decoys)
-    require_folds(len(parts.attack), plan)
     rng = np.random.default_rng([plan.seed, 1])
     order = rng.permutation(len(parts.attack))
     number = np.empty(len(order), dtype=np.int64)

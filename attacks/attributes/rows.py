@@ -8,12 +8,13 @@ dealt out at random.
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from attacks.outcomes import AuditError, KnowledgeLevel, Scheme
+from attacks.outcomes import KnowledgeLevel, Scheme
 from templates.contract.canonical import Json
 from templates.contract.levels import Rate
 from verify.metrics import rate
@@ -84,10 +85,6 @@ class AttributeRow:
         """
         return abs(self.accuracy.value - self.chance_of_predictions)
 
-    def chosen_by(self, at_home: "AttributeRow") -> "AttributeRow":
-        """Return the row with what the attacker reached on its own faces."""
-        return replace(self, held_out=at_home.strength)
-
     def to_json(self) -> dict[str, Json]:
         """Return a row of ``rows`` of the report."""
         return {
@@ -113,36 +110,17 @@ class AttributeRow:
 
 
 def measure(
-    predicted: Codes,
-    truth: Codes,
-    *,
-    scheme: Scheme,
-    attribute: str,
-    attacker: str,
-    metric: str | None,
-    knowledge: KnowledgeLevel,
-    classes: tuple[str, ...],
-    seed: int,
+    predicted: Codes, truth: Codes, *, classes: tuple[str, ...], **names: Any
 ) -> AttributeRow:
     """Compare predictions with the truth; both are class numbers, (N,) int64.
 
-    Raises
-    ------
-    AuditError
-        There are no predictions, or not as many as truths.
+    ``names`` are the fields of the row that say what was attacked, and by whom.
     """
-    if not len(truth) or len(predicted) != len(truth):
-        raise AuditError(f"{len(predicted)} predictions do not fit {len(truth)} attacked faces")
     size, count = len(classes), len(truth)
     table = np.bincount(truth * size + predicted, minlength=size**2).reshape(size, size)
     of_truth, of_predicted = table.sum(axis=1), table.sum(axis=0)
     occurring = of_truth > 0
     return AttributeRow(
-        scheme=scheme,
-        attribute=attribute,
-        attacker=attacker,
-        metric=metric,
-        knowledge=knowledge,
         classes=classes,
         accuracy=rate(int(np.trace(table)), count),
         balanced_accuracy=float(np.mean(np.diag(table)[occurring] / of_truth[occurring])),
@@ -152,7 +130,7 @@ def measure(
             "majority": float(of_truth.max()) / count,
             "same_predictions": float(of_truth @ of_predicted) / count**2,
         },
-        seed=seed,
+        **names,
     )
 
 

@@ -67,16 +67,7 @@ def nearest_neighbour(bed: Testbed) -> Iterator[Guesses]:
 def best_of(
     gallery: NDArray[np.float32], entries: NDArray[np.int64], truth: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """Return the row of ``gallery[entries[i]]`` that is nearest to truth i, shape (T, k).
-
-    Parameters
-    ----------
-    gallery : (G, k)
-        Unit rows.
-    entries : (T, K)
-    truth : (T, k)
-        Unit rows.
-    """
+    """Return the row of ``gallery[entries[i]]`` that is nearest to truth i; unit rows (T, k)."""
     cosines = np.einsum("tkn,tn->tk", gallery[entries], truth)
     return np.asarray(gallery[entries[np.arange(len(entries)), np.argmax(cosines, axis=1)]])
 

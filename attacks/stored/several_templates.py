@@ -45,11 +45,7 @@ def nearest_to_all(bed: Testbed) -> Iterator[Guesses]:
 def meeting_point(feet: Array, bases: Array) -> Array:
     """Find the point of least Σ dist² to T affine subspaces; of several, the one of least norm.
 
-    Parameters
-    ----------
-    feet : (T, k)
-    bases : (T, m, k)
-        Orthonormal, orthogonal to their foot points.
+    Feet are (T, k); bases (T, m, k), orthonormal and orthogonal to their foot points.
 
     Notes
     -----
@@ -66,14 +62,9 @@ def meeting_point(feet: Array, bases: Array) -> Array:
 
 
 def nearest_common_point(feet: Array, bases: Array, starts: Array) -> Array:
-    """Find the unit vector of largest Σ sim to T affine subspaces.
+    """Find the unit vector of largest Σ sim to T affine subspaces (as in ``meeting_point``).
 
-    Parameters
-    ----------
-    feet, bases
-        As in ``meeting_point``.
-    starts : (S, k)
-        Where to start from; the best end is returned.
+    The search begins at each of ``starts``, (S, k); the best end is returned.
 
     Notes
     -----

@@ -25,8 +25,6 @@ from verify.comparisons import through_wire
 TARGETS = 150
 """Templates that the attacker lifts to choose by."""
 AXES = 64
-CENTRAL = "axes through the origin"
-ALONG_MEAN = "foot point along the mean face"
 _LEADING = 6
 _FOOT_FACTORS = (0.8, 1.0, 1.2)
 _LIFTS = Knowledge(template=False, faces=True, lifting=True)
@@ -48,11 +46,10 @@ def lifted_wolf(bed: Testbed) -> Iterator[Probes]:
         return
     low, high = bed.lifted.foot_point_norm or (0.0, 1.0)
     wolves = axis_wolves(bed.gallery, bed.lifted.probe_m, foot_norm=(low + high) / 2, seed=bed.seed)
-    for family, made in wolves.items():
-        received = through_wire(made, contract_id=bed.service.contract_id)
-        honest = passes_checks(received, bed.lifted)
-        kept = received[honest] if honest.any() else received
-        yield Probes(kept[_ranked(bed, kept, bed.lifted)[:1]], family)
+    received = through_wire(wolves, contract_id=bed.service.contract_id)
+    honest = passes_checks(received, bed.lifted)
+    kept = received[honest] if honest.any() else received
+    yield Probes(kept[_ranked(bed, kept, bed.lifted)[:1]], "foot point along the mean face")
 
 
 def _ranked(bed: Testbed, wolves: Sent, calibration: Calibration) -> NDArray[np.int64]:
@@ -61,15 +58,11 @@ def _ranked(bed: Testbed, wolves: Sent, calibration: Calibration) -> NDArray[np.
     Lifted wolves are held against a cohort of the attacker's own, for the service's is secret.
     """
     faces = np.random.default_rng(bed.seed).permutation(bed.gallery)[:TARGETS]
-    cohort = None
-    if isinstance(wolves, SubspaceBatch):
-        stream = Keystream.seeded("audit", bed.seed, str(bed.scheme), "attacker's cohort")
-        seed = stream.token(KEY_BYTES)
-        generator = client_source(bed.source)
-        cohort = Nobody(generator, plain_strategy(bed.strategy), bed.m, seed).cohort
-    scores = scored(
-        wolves, bed.lift(faces, "attacker's targets"), bed.nobody, calibration, cohort=cohort
+    stream = Keystream.seeded("audit", bed.seed, str(bed.scheme), "attacker's cohort")
+    nobody = Nobody(
+        client_source(bed.source), plain_strategy(bed.strategy), bed.m, stream.token(KEY_BYTES)
     )
+    scores = scored(wolves, bed.lift(faces, "attacker's targets"), nobody, calibration)
     accepted = scores >= calibration.level(bed.service.default_level).threshold
     return np.lexsort((-scores.mean(axis=1), -accepted.mean(axis=1)))
 
@@ -85,11 +78,11 @@ def plain_wolves(faces: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def axis_wolves(
     faces: NDArray[np.float32], m: int, *, foot_norm: float, seed: int
-) -> dict[str, SubspaceBatch]:
-    """Lifted probes of dimension m near everybody, learnt from (N, k) unit embeddings; by family.
+) -> SubspaceBatch:
+    """Lifted probes of dimension m near everybody, learnt from (N, k) unit embeddings.
 
     ``foot_norm`` is that of an honest probe's foot point: wolves have it, a fifth less and a fifth
-    more, and 0.
+    more. Their foot points lie along the mean face; one at the origin fails the input checks.
     """
     rng = np.random.default_rng(seed)
     mean = faces.mean(axis=0, dtype=np.float64)
@@ -100,14 +93,13 @@ def axis_wolves(
         taken = axes[: width * m]
         mixes = (np.linalg.qr(rng.standard_normal((len(taken), m)))[0] for _ in range(4))
         bases += [mix.T @ taken for mix in mixes]
-    wolves: dict[str, list[SubspaceBatch]] = {CENTRAL: [], ALONG_MEAN: []}
+    wolves = []
     for basis in bases:
-        wolves[CENTRAL].append(canonical(np.zeros_like(mean), basis))
+        direction = mean - basis.T @ (basis @ mean)
+        direction /= np.linalg.norm(direction)
         for factor in _FOOT_FACTORS:
-            direction = mean - basis.T @ (basis @ mean)
-            foot = min(factor * foot_norm, 0.99) * direction / np.linalg.norm(direction)
-            wolves[ALONG_MEAN].append(canonical(foot, basis))
-    return {family: SubspaceBatch.of(made) for family, made in wolves.items()}
+            wolves.append(canonical(min(factor * foot_norm, 0.99) * direction, basis))
+    return SubspaceBatch.of(wolves)
 
 
 def canonical(foot: Array, basis: Array) -> SubspaceBatch:

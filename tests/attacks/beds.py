@@ -22,7 +22,8 @@ from verify import CalibrationOptions
 VICTIMS, OWNERS, M, AXES = 40, 120, 6, 60
 PEOPLE = draw_people(900, photos=(4, 2, 3), noise=0.35, seed=3)
 PACK = cast(
-    "ModelPack", SimpleNamespace(info=SimpleNamespace(embedder_sha256="ab" * 32, preprocessing={}))
+    "ModelPack",
+    SimpleNamespace(info=SimpleNamespace(embedder_sha256="ab" * 32, preprocessing={}, n=64)),
 )
 # Fewer comparisons than the audit's, so that a bed takes a second or two; as many as FMR 1e-3 is
 # resolved by.

@@ -44,12 +44,6 @@ def test_more_decoys_of_the_same_kind_hide_more() -> None:
     assert many.value < few.value - 0.3
 
 
-def test_photos_of_other_people_are_matched_by_chance() -> None:
-    thefts = thieves(setup_with(OTHER, shuffled=True).bed(Strategy.ADVERSARIAL, axes=N, m=8))
-    assert best(thefts).matched.value < 0.05
-    assert max(theft.control.value for theft in thefts) < 0.05
-
-
 def test_attackers_are_named_by_their_faces_and_how_they_count_them() -> None:
     thefts = thieves(setup_with(FACES).bed(Strategy.HYBRID, axes=N, m=4))
     named = [(one.attack, one.faces, one.to_json()["share_of_decoys"]) for one in thefts]
@@ -124,13 +118,8 @@ def test_a_verdict_has_its_hundred_victims_before_a_choice_has_any(
 
 def test_what_does_not_fit_is_refused() -> None:
     setup = setup_with(FACES)
-    small = np.eye(8, dtype=np.float32)
-    with pytest.raises(AuditError, match="of 48 numbers"):
-        AttackSetup.of(Pairs(small, small), small, setup.source)
     with pytest.raises(AuditError, match="fresh photo"):
-        AttackSetup.of(
-            Pairs(setup.victims.enrolled, setup.victims.fresh[:3]), setup.faces, setup.source
-        )
+        AttackSetup.of(setup.victims[:0], setup.faces, setup.source)
     with pytest.raises(DecoyError, match="have all 64 numbers"):
         make_pool().reduced(60)
 

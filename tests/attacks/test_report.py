@@ -1,8 +1,5 @@
 import json
-from dataclasses import replace
 from typing import Any
-
-import pytest
 
 from attacks.outcomes import AttackOutcome, Estimate, KnowledgeLevel, Leaked, Property, Scheme
 from attacks.report import document
@@ -11,9 +8,6 @@ from verify.metrics import rate
 
 SCHEME = Scheme("adversarial", "generator", 16)
 OTHER = Scheme("adversarial", "pool", 16)
-
-
-NOT_SHOWN = "NOT SHOWN: no limit is exceeded, and not every one is shown to hold."
 
 
 def outcomes(scheme: Scheme, hits: int) -> list[AttackOutcome]:
@@ -83,33 +77,6 @@ def test_a_comparison_does_not_decide_and_is_said_apart() -> None:
     assert not any("pool" in line for line in report["headlines"])
     assert "irreversibility fails: foot-point" in report["comparison_headlines"][0]
     assert json.loads(json.dumps(report, allow_nan=False)) == report
-
-
-def unjudged(scheme: Scheme) -> list[AttackOutcome]:
-    return [replace(row, unjudged="its control fails") for row in outcomes(scheme, 0)]
-
-
-@pytest.mark.parametrize(
-    ("rows", "passed", "result"),
-    [
-        ([], None, NOT_SHOWN),
-        ([*outcomes(OTHER, 0), *unjudged(SCHEME)], None, NOT_SHOWN),
-        ([*outcomes(OTHER, 150), *unjudged(SCHEME)], False, "FAILED: a limit is exceeded."),
-        (outcomes(SCHEME, 0), True, "PASSED"),
-    ],
-)
-def test_nothing_judged_is_neither_passed_nor_failed(
-    rows: list[AttackOutcome], passed: bool | None, result: str
-) -> None:
-    report = document("fairface", outcomes=rows, limits={}, model={}, settings={})
-    assert report["passed"] is passed
-    assert json.loads(json.dumps(report))["passed"] is passed
-    text = markdown(report)
-    assert text.splitlines()[2] == f"**{result}**"
-    said = "adversarial, m = 16, generated decoys: no attack was judged, so it neither passed nor"
-    without_verdict = bool(rows) and passed is not True
-    assert any(line.startswith(said) for line in report["headlines"]) == without_verdict
-    assert ("On this scheme no attack was judged" in text) == without_verdict
 
 
 def test_the_markdown_begins_with_the_result_and_shows_every_attack() -> None:

@@ -46,28 +46,65 @@ def outcome(
     )
 
 
+def d_sys(value: float, low: float, high: float) -> Estimate:
+    return Estimate(value, low, high, 400, "bootstrap")
+
+
 def only_cell(*outcomes: AttackOutcome, limits: dict[str, float] | None = None) -> Cell:
     (verdict,) = judge(outcomes, limits=limits)
     (cell,) = verdict.cells
     return cell
 
 
+RECOVERED, SENT = Property.IRREVERSIBILITY, Property.IMPERSONATION
+LINKED, TOLD = Property.UNLINKABILITY, Property.CONFIDENTIALITY
+KEPT = {"leaked": Leaked.MASTER_KEY}
+SEVERAL = {"knowledge": KnowledgeLevel.TEMPLATES}
+
+
 @pytest.mark.parametrize(
-    ("hits", "trials", "status"),
+    ("row", "limit", "excess", "status"),
     [
-        (0, 1000, Status.PASS),
-        (15, 300, Status.PASS),
-        (6, 100, Status.FAIL),
-        (5, 100, Status.NOT_SHOWN),
+        (outcome(RECOVERED, rate(0, 1000)), "recovery-success", 0.0, Status.PASS),
+        (outcome(RECOVERED, rate(15, 300)), "recovery-success", 0.05, Status.PASS),
+        (outcome(RECOVERED, rate(6, 100)), "recovery-success", 0.06, Status.FAIL),
+        (outcome(RECOVERED, rate(5, 100)), "recovery-success", 0.05, Status.NOT_SHOWN),
+        # Accuracy on either side of chance, as a share of what raw embeddings gain.
+        (outcome(TOLD, rate(300, 1000), chance=0.5), "attribute-leakage", 0.5, Status.FAIL),
+        (outcome(TOLD, rate(700, 1000), chance=0.5), "attribute-leakage", 0.5, Status.FAIL),
+        # D_sys above its null, and below it.
+        (outcome(LINKED, d_sys(0.95, 0.9, 0.98), chance=0.085, **KEPT),
+         "linkability", 0.865, Status.FAIL),
+        (outcome(LINKED, d_sys(0.01, 0.0, 0.05), chance=0.085, **KEPT),
+         "linkability", 0.0, Status.PASS),
+        # A secret rotation leaves next to nothing.
+        *((outcome(breaks, rate(hits, 1000), **KEPT, **more), "success-without-key",
+           hits / 1000, status)
+          for breaks in (RECOVERED, SENT) for more in ({}, SEVERAL)
+          for hits, status in ((1, Status.PASS), (30, Status.FAIL))),
+        # What no template withstands has no limit.
+        (outcome(RECOVERED, rate(100, 100), **SEVERAL), "success-with-key", 1.0, Status.UNLIMITED),
+        (outcome(Property.RENEWABILITY, rate(100, 100)), "success-with-key", 1.0, Status.UNLIMITED),
+        (outcome(SENT, rate(100, 100)), "success-with-key", 1.0, Status.UNLIMITED),
     ],
-)
-def test_a_recovery_is_compared_with_its_limit(hits: int, trials: int, status: Status) -> None:
-    cell = only_cell(outcome(Property.IRREVERSIBILITY, rate(hits, trials)))
-    assert cell.limit == "recovery-success"
-    assert cell.most == 0.05
-    assert cell.excess == hits / trials
-    assert (cell.low, cell.high) == (wilson(hits, trials)[0], upper_bound(hits, trials))
-    assert cell.status is status
+)  # fmt: skip
+def test_a_row_is_compared_with_its_limit(
+    row: AttackOutcome, limit: str, excess: float, status: Status
+) -> None:
+    cell = only_cell(row)
+    assert (cell.limit, cell.status) == (limit, status)
+    assert cell.excess == pytest.approx(excess)
+    if status is Status.UNLIMITED:
+        assert f"leaked {row.leaked}" in headlines(judge([row]))[0]
+        assert only_cell(row, limits={limit: 0.5}).status is Status.FAIL
+
+
+def test_bounds_are_those_of_wilson_and_the_upper_one_is_one_sided() -> None:
+    cell = only_cell(outcome(RECOVERED, rate(15, 300)))
+    assert (cell.low, cell.high) == (wilson(15, 300)[0], upper_bound(15, 300))
+    low, high = wilson(300, 1000)
+    cell = only_cell(outcome(TOLD, rate(300, 1000), chance=0.5))
+    assert (cell.low, cell.high) == pytest.approx(((0.5 - high) / 0.4, (0.5 - low) / 0.4))
 
 
 def test_what_an_attacker_had_too_little_for_is_not_shown() -> None:
@@ -102,32 +139,6 @@ def test_the_foot_point_has_a_limit_and_a_cell_of_its_own() -> None:
     assert not verdict.passed
 
 
-@pytest.mark.parametrize("correct", [300, 700])
-def test_accuracy_fails_on_either_side_of_chance(correct: int) -> None:
-    cell = only_cell(outcome(Property.CONFIDENTIALITY, rate(correct, 1000), chance=0.5))
-    low, high = wilson(correct, 1000)
-    assert cell.excess == pytest.approx(0.2 / 0.4)  # of what raw embeddings gain
-    assert cell.low == pytest.approx(min(abs(low - 0.5), abs(high - 0.5)) / 0.4)
-    assert cell.high == pytest.approx(max(abs(low - 0.5), abs(high - 0.5)) / 0.4)
-    assert cell.status is Status.FAIL
-
-
-@pytest.mark.parametrize(
-    ("measured", "excess", "status"),
-    [
-        (Estimate(0.95, 0.9, 0.98, 400, "bootstrap"), 0.865, Status.FAIL),
-        (Estimate(0.01, 0.0, 0.05, 400, "bootstrap"), 0.0, Status.PASS),  # below its null
-    ],
-)
-def test_linkability_is_compared_above_its_null(
-    measured: Estimate, excess: float, status: Status
-) -> None:
-    stolen = Leaked.MASTER_KEY
-    cell = only_cell(outcome(Property.UNLINKABILITY, measured, leaked=stolen, chance=0.085))
-    assert (cell.limit, cell.status) == ("linkability", status)
-    assert cell.excess == pytest.approx(excess)
-
-
 def test_a_doubt_is_not_hidden_behind_a_small_success() -> None:
     known = outcome(Property.IRREVERSIBILITY, rate(1, 1000), attack="measured well")
     doubtful = outcome(Property.IRREVERSIBILITY, rate(0, 10), attack="measured on few")
@@ -136,41 +147,6 @@ def test_a_doubt_is_not_hidden_behind_a_small_success() -> None:
         assert cell.outcome.attack == "measured on few"
         assert cell.status is Status.NOT_SHOWN
     assert not any("no attack" in line for line in headlines(judge([known, doubtful])))
-
-
-@pytest.mark.parametrize(
-    ("breaks", "leaked", "knowledge"),
-    [
-        (Property.IRREVERSIBILITY, Leaked.HOLDER_KEYS, KnowledgeLevel.TEMPLATES),
-        (Property.RENEWABILITY, Leaked.HOLDER_KEYS, KnowledgeLevel.ALGORITHM),
-        (Property.IMPERSONATION, Leaked.HOLDER_KEYS, KnowledgeLevel.ALGORITHM),
-    ],
-)
-def test_what_no_template_withstands_is_without_a_limit_and_says_why(
-    breaks: Property, leaked: Leaked, knowledge: KnowledgeLevel
-) -> None:
-    broken = outcome(breaks, rate(100, 100), leaked=leaked, knowledge=knowledge)
-    cell = only_cell(broken)
-    assert (cell.limit, cell.status) == ("success-with-key", Status.UNLIMITED)
-    assert cell.reason
-    line, _no_limit_exceeded = headlines(judge([broken]))
-    assert f"leaked {leaked}" in line
-    assert line.endswith(f"By design: {cell.reason}.")
-    limited = only_cell(broken, limits={"success-with-key": 0.5})
-    assert (limited.status, limited.reason) == (Status.FAIL, None)
-
-
-@pytest.mark.parametrize("knowledge", [KnowledgeLevel.ALGORITHM, KnowledgeLevel.TEMPLATES])
-@pytest.mark.parametrize("breaks", [Property.IRREVERSIBILITY, Property.IMPERSONATION])
-def test_a_secret_rotation_leaves_next_to_nothing(
-    breaks: Property, knowledge: KnowledgeLevel
-) -> None:
-    def cell(hits: int) -> Cell:
-        stolen = Leaked.MASTER_KEY
-        return only_cell(outcome(breaks, rate(hits, 1000), leaked=stolen, knowledge=knowledge))
-
-    assert (cell(1).limit, cell(1).status) == ("success-without-key", Status.PASS)
-    assert cell(30).status is Status.FAIL
 
 
 def test_what_leaked_parts_the_cells() -> None:

@@ -127,20 +127,11 @@ def test_aligned_crops_skip_detection(mbf_pack_dir, lfw_aligned, monkeypatch):
     np.testing.assert_allclose(result.embeddings, pack.embed(crops), atol=1e-5)
 
 
-def test_both_kinds_at_once_are_those_of_two_packs(tmp_path, files, monkeypatch):
-    monkeypatch.setattr(extraction, "CHUNK", 3)
+def test_a_cache_keeps_plain_and_flipped_embeddings_apart(tmp_path, files):
     folder = write_pack(tmp_path / "p", e=pooling_embedder())
     plain, flipped = (ModelPack.load(folder, threads=1, flip=flip) for flip in (False, True))
     cache = EmbeddingCache()
-    both = Extractor(plain, mirrored=True, cache=cache).extract(files)
-    np.testing.assert_array_equal(both.embeddings, Extractor(plain).extract(files).embeddings)
-    np.testing.assert_array_equal(both.mirrored, Extractor(flipped).extract(files).embeddings)
-    # What one of the packs has embedded alone is known to both, and the other way round.
+    made = [Extractor(pack, cache=cache).extract(files) for pack in (plain, flipped)]
+    assert [extraction.cached for extraction in made] == [0, 0]
     assert len(cache) == 2 * len(files)
     assert Extractor(flipped, cache=cache).extract(files).cached == len(files)
-    again = Extractor(plain, mirrored=True, cache=cache).extract(files)
-    assert again.cached == len(files)
-    np.testing.assert_array_equal(again.mirrored, both.mirrored)
-    with pytest.raises(ValueError, match="adds the mirror image already"):
-        Extractor(flipped, mirrored=True)
-    assert Extractor(plain).extract(files).mirrored is None

@@ -1,17 +1,13 @@
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from templates.errors import ContractError
 from verify import CalibrationOptions
-from verify.metrics import threshold_at_fmr
 from verify.thresholds import (
     Genuine,
     Impostors,
     bound_when_set_anew,
-    highest_scores,
     level_name,
     make_level,
     resolved_targets,
@@ -32,24 +28,6 @@ def all_of(people: int) -> Impostors:
     cells = np.random.default_rng(0).normal(size=(people, people)).astype(np.float32)
     np.fill_diagonal(cells, -np.inf)
     return Impostors(cells, everybody, everybody[None], people, people)
-
-
-@given(
-    st.lists(st.integers(-9, 9), min_size=5, max_size=60),
-    st.integers(0, 20),
-    st.lists(st.sampled_from([0.3, 0.1, 0.05, 0.01]), min_size=1, max_size=3),
-)
-def test_the_highest_scores_set_the_thresholds_of_all(
-    values: list[int], cells: int, targets: list[float]
-) -> None:
-    """Those that are no trials count nowhere."""
-    scores = np.array([*values, *([-np.inf] * cells)], dtype=np.float32) / 4
-    impostors = impostors_of(scores)
-    highest = highest_scores(impostors, targets)
-    for target in targets:
-        threshold = threshold_at_fmr(highest, target, trials=impostors.trials)
-        assert threshold == threshold_at_fmr(scores[: len(values)], target)
-        assert np.count_nonzero(scores >= np.float64(threshold)) <= target * len(values)
 
 
 def test_levels_are_refused_that_the_data_cannot_resolve() -> None:

@@ -3,7 +3,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.verify.synthetic import draw_people
-from verify.trials import GROUP, chosen_photos, impostor_groups, plan_trials, probe_sets
+from verify.trials import GROUP, impostor_groups, plan_trials, probe_sets
 
 names = st.lists(st.sampled_from(["a", "b", "c", "d"]), min_size=1, max_size=30)
 
@@ -46,12 +46,6 @@ def test_each_group_of_probes_meets_distinct_people_of_its_own() -> None:
     assert len({tuple(people) for people in groups.tolist()}) > 1
     everybody = impostor_groups(plan, 11, pairs=10**6, rng=np.random.default_rng(1))
     assert everybody.tolist() == [list(range(8))]
-
-
-def test_excluded_people() -> None:
-    photos, people = chosen_photos(["Ann", "Bob", "Ann", "Cid"], exclude={"Cid", "Bob"})
-    assert photos.tolist() == [0, 2]
-    assert people == ["Ann", "Ann"]
 
 
 def test_sets_of_photos_are_runs_around_a_circle() -> None:

@@ -289,66 +289,6 @@ def test_scores_stay_out_of_the_repr(verifier: Verifier, stored: list[Enrollment
     assert str(decision.distance) not in text
 
 
-def test_wolves_are_stopped_by_what_is_expected_of_them(contract: Contract) -> None:
-    """A common mean makes wolves (docs/method.md §4.7), near to everybody."""
-    rng = np.random.default_rng(0)
-    # Face descriptors are not centred: a few axes carry most of their spread.
-    spread = np.concatenate([np.full(4, 3.0), np.ones(N - 4)])
-    centres = unit(rng.normal(size=(200, N)) * spread)
-    photos = unit(np.repeat(centres, 3, axis=0) + 0.3 * unit(rng.normal(size=(600, N))))
-    names = [f"p{i // 3:03d}" for i in range(600)]
-    source = DecoyGenerator.fit(unit(rng.normal(size=(500, N)) * spread)).reduced(K)
-    from tests.verify.synthetic import make_binding
-    from verify import CalibrationOptions, calibrate
-
-    wolves_contract = calibrate(
-        photos,
-        names,
-        binding=make_binding(source.source_id),
-        source=source,
-        options=CalibrationOptions(
-            probe_dims=(0, 4), lifted_probes=200, lifted_impostor_pairs=20_000, steps=20
-        ),
-    ).contract
-    rotation = tenant_rotation()
-    enroller = Enroller(wolves_contract, source, rotation=rotation, lift_secret=LIFT_SECRET)
-    verifier = Verifier(wolves_contract, source, rotation=rotation)
-    calibration = wolves_contract.calibration("s2s", None, 4)
-    assert calibration.foot_point_norm is not None
-    # A wolf with a plausible foot point, spanned by the leading axes.
-    foot = np.zeros(K, dtype=np.float32)
-    foot[4] = np.mean(calibration.foot_point_norm)
-    wolf = wire.encode(
-        SubspaceBatch(foot, np.eye(K, dtype=np.float32)[:4]),
-        contract_id=wolves_contract.contract_id,
-    )
-    people = unit(rng.normal(size=(150, N)) * spread)
-    decisions = [
-        verifier.decide_template(wolf, enroller.from_embeddings(row), level="fmr-1e-2")
-        for row in people
-    ]
-    # The wolf is nearer to nearly all of them than people are to each other's templates.
-    near = [
-        verifier.decide_template(
-            lifted(wolves_contract, people[i - 1], m=4, source=source),
-            enroller.from_embeddings(people[i]),
-        ).similarity
-        for i in range(40)
-    ]
-    assert np.mean([d.similarity for d in decisions]) > np.quantile(near, 0.9)
-    assert np.mean([d.accepted for d in decisions]) < 0.05
-    # As a raw probe, the leading axis: near to all, and expected to be.
-    axis = source.axes[:, 0]
-    raw = [
-        verifier.decide_embedding(axis, enroller.from_embeddings(row), level="fmr-1e-2")
-        for row in people
-    ]
-    points = source.project(np.stack([axis, people[0]]))
-    means, _ = wolves_contract.nobody(source).statistics(points, Metric.SPHERICAL)
-    assert means[0] > means[1] + 0.1
-    assert np.mean([d.accepted for d in raw]) < 0.05
-
-
 def test_photos_of_a_probe_need_to_agree_less_than_those_of_an_enrollment(
     contract: Contract,
 ) -> None:

@@ -11,7 +11,7 @@ from templates.distances import Metric, paired_distances, similarity
 from templates.keys.randomness import Keystream
 from templates.space.lifting import Strategy, lift
 from templates.space.subspace import SubspaceBatch
-from verify.evaluation.plan import RAW, EvaluationPlan, Json, Mode, Source, Unit, decoy_kind
+from verify.evaluation.plan import EvaluationPlan, Json, Mode, Source, Unit, decoy_kind
 
 _TILE = 8192
 """Subspace rows (pairs times m) that are lifted at once on either side."""
@@ -23,7 +23,6 @@ class Trials:
 
     name: str
     embeddings: NDArray[np.float32]  # (N, n) unit rows
-    mirrored: NDArray[np.float32] | None  # the same with the mirror image added
     first: NDArray[np.int64]  # (P,) rows, as `second`
     second: NDArray[np.int64]
     same: NDArray[np.bool_]
@@ -66,12 +65,9 @@ def compare(
         "dim": unit.m,
     }
     if unit.raw:
-        rows = trials.embeddings if unit.strategy == RAW else trials.mirrored
-        if rows is None:
-            raise ValueError("embeddings with the mirror image were not acquired")
         names |= {"mode": Mode.RAW.value, "metric": Metric.EUCLIDEAN.value}
         names |= {"seed": None, "lifted": None}
-        return [(names, _cosines(rows, trials.first, trials.second))]
+        return [(names, _cosines(trials.embeddings, trials.first, trials.second))]
     if unit.source is not None:
         names["decoys"] = decoy_kind(trials.sources[unit.source])
         names["shared_decoys"] = plan.shared_decoys if names["decoys"] == "pool" else None

@@ -14,7 +14,7 @@ from models.extraction import Extractor, Failure
 from models.pack import ModelPack
 from verify.evaluation.embeddings_file import EmbeddingsFile, match
 from verify.evaluation.plan import EvaluationError, Json
-from verify.evaluation.provenance import Model
+from verify.evaluation.provenance import model_facts
 from verify.evaluation.verification_set import Indices, VerificationSet
 
 Advance = Callable[[int], None]
@@ -30,7 +30,6 @@ class EmbeddedSet:
     embeddings: NDArray[np.float32]  # (k, n) unit rows
     rows: Indices  # of each photo; -1 where it failed
     failures: tuple[Failure, ...]  # the others; ``path`` is the photo's name
-    mirrored: NDArray[np.float32] | None = None  # the same rows with the mirror image added
     aligned: bool | None = None  # None where the photos were not embedded here
 
 
@@ -42,10 +41,10 @@ class FileEmbedder:
     name: str
 
     @property
-    def model(self) -> Model:
-        """Name and SHA-256 of the file."""
-        facts: Json = {"embeddings": self.name, "sha256": self.file.sha256}
-        return Model(int(self.file.embeddings.shape[1]), facts)
+    def model(self) -> Json:
+        """Dimension, name and SHA-256 of the file."""
+        n = int(self.file.embeddings.shape[1])
+        return {"n": n, "embeddings": self.name, "sha256": self.file.sha256}
 
     def embed(
         self, pairs: VerificationSet, *, cache: EmbeddingCache | None, progress: Progress
@@ -71,14 +70,12 @@ class PackEmbedder:
 
     pack: ModelPack
     facts: Json
-    mirrored: bool  # whether embeddings with the mirror image are wanted too
     aligned: bool | None  # None to see for each set
 
     @property
-    def model(self) -> Model:
+    def model(self) -> Json:
         """What a contract binds of the pack, and the recorded facts."""
-        info = self.pack.info
-        return Model(info.n, self.facts, info.embedder_sha256, info.preprocessing)
+        return model_facts(self.pack.info, self.facts)
 
     def embed(
         self, pairs: VerificationSet, *, cache: EmbeddingCache | None, progress: Progress
@@ -86,7 +83,7 @@ class PackEmbedder:
         """Embed the photos of a set; those that fail are counted."""
         aligned = self._aligned(pairs)
         photos = [replace(one, name=str(place)) for place, one in enumerate(pairs.pictures)]
-        extractor = Extractor(self.pack, aligned=aligned, cache=cache, mirrored=self.mirrored)
+        extractor = Extractor(self.pack, aligned=aligned, cache=cache)
         with progress(f"embedding {pairs.name}", len(photos)) as advance:
             extraction = extractor.extract(photos, progress=advance)
         rows = np.full(len(photos), -1, dtype=np.int64)
@@ -95,9 +92,7 @@ class PackEmbedder:
             replace(failure, path=Path(pairs.pictures[int(failure.path.name)].name))
             for failure in extraction.failures
         )
-        return EmbeddedSet(
-            pairs, extraction.embeddings, rows, failures, extraction.mirrored, aligned
-        )
+        return EmbeddedSet(pairs, extraction.embeddings, rows, failures, aligned)
 
     def _aligned(self, pairs: VerificationSet) -> bool:
         size = int(self.pack.info.preprocessing["size"])

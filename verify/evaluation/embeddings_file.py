@@ -61,12 +61,10 @@ def read_content(file: Path) -> EmbeddingsFile:
         if name not in arrays:
             raise DatasetError(f"{file} has no array {name}, only {', '.join(there)!a}; {_KEYS}")
     paths, rows = (np.asarray(arrays[name]) for name in _NAMES)
-    for name, array, fits in (
-        ("paths", paths, paths.dtype.kind == "U"),
-        ("descriptors", rows, rows.dtype.newbyteorder("=") in _FLOATS),
-    ):
-        if not fits:
-            raise DatasetError(f"{file}: {name} is of type {array.dtype}; {_KEYS}")
+    if paths.dtype.kind != "U" or rows.dtype.newbyteorder("=") not in _FLOATS:
+        raise DatasetError(
+            f"{file}: paths are of type {paths.dtype}, descriptors of type {rows.dtype}; {_KEYS}"
+        )
     if paths.ndim != 1 or rows.ndim != 2 or len(paths) != len(rows) or 0 in rows.shape:
         raise DatasetError(
             f"{file} has paths of shape {paths.shape} and descriptors of shape {rows.shape}; "

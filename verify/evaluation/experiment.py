@@ -10,7 +10,6 @@ from functools import partial
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from models.cache import EmbeddingCache
 from templates.decoys import Attributes
@@ -119,14 +118,10 @@ def averaged(faces: EmbeddedSet, templates: Sequence[Sequence[int]]) -> Embedded
     acquired = [[row for row in faces.rows[list(photos)] if row >= 0] for photos in templates]
     present = np.array([bool(rows) for rows in acquired])
 
-    def means(embeddings: NDArray[np.float32]) -> NDArray[np.float32]:
-        sums = [embeddings[rows].sum(axis=0, dtype=np.float64) for rows in acquired if rows]
-        return normalised(np.stack(sums)).astype(np.float32)
-
+    sums = [faces.embeddings[rows].sum(axis=0, dtype=np.float64) for rows in acquired if rows]
     return replace(
         faces,
-        embeddings=means(faces.embeddings),
-        mirrored=None if faces.mirrored is None else means(faces.mirrored),
+        embeddings=normalised(np.stack(sums)).astype(np.float32),
         rows=np.where(present, np.cumsum(present) - 1, -1),
     )
 
@@ -153,7 +148,6 @@ def trials_of(
     return Trials(
         name=pairs.name,
         embeddings=faces.embeddings,
-        mirrored=faces.mirrored,
         first=first[kept],
         second=second[kept],
         same=same,

@@ -1,7 +1,7 @@
 """Error rates by group of people, at the one threshold that holds for all (ISO/IEC 19795-10).
 
 A genuine trial belongs to the group that both photos are labelled with; an impostor trial counts
-for a group's FMR where both people are in it, and as a cross trial where they are in two.
+for a group's FMR where both people are in it.
 """
 
 import math
@@ -53,11 +53,10 @@ def by_group(
 
     Returns the groups' ``fmr`` and ``fnmr``, ages in the order of years, and a summary. ``judged``
     says whether a rate has trials enough to be compared: for the FMR :func:`fmr_judged`, for the
-    FNMR ``MIN_GENUINE``. The summary has the rates of all trials (``overall``), of those within a
-    group (``pooled``) and of two groups (``cross_fmr``); genuine trials of photos with two labels
-    (``mixed``); trials without a label; the ``worst`` judged group, ``apart`` where its interval,
-    at 1 − 0.05 / groups, lies above the pooled rate; and the worst rate over the geometric mean of
-    the judged ones, the ``ratio`` of ISO/IEC 19795-10 and of NIST's FRVT (IR 8429).
+    FNMR ``MIN_GENUINE``. The summary has the rates of all trials within a group (``pooled``); the
+    ``worst`` judged group, ``apart`` where its interval (at 1 − 0.05 / groups) is above the pooled
+    rate; and the worst rate over the geometric mean of the judged ones, the ``ratio`` of ISO/IEC
+    19795-10 and of NIST's FRVT (IR 8429).
     """
     wrong = sum(
         ((run >= limit) != same).astype(np.int64)
@@ -71,8 +70,7 @@ def by_group(
     first, second = (
         np.array([label or "" for label in labels]) for labels in (first_labels, second_labels)
     )
-    labelled = (first != "") & (second != "")
-    together = labelled & (first == second)
+    together = (first != "") & (first == second)
     head: Json = {
         "attribute": attribute,
         "target_fmr": target_fmr,
@@ -86,19 +84,13 @@ def by_group(
         fmr["judged"] = fmr_judged(fmr["trials"], target_fmr)
         fnmr["judged"] = fnmr["trials"] >= MIN_GENUINE
         groups.append({**head, "group": name, "fmr": fmr, "fnmr": fnmr})
-    summary: Json = {**head, "overall_fmr": counted(~same), "overall_fnmr": counted(same)}
+    summary = dict(head)
     for kind, trials in (("fmr", ~same), ("fnmr", same)):
         pooled = summary[f"pooled_{kind}"] = counted(trials & together)
         judged = [(group["group"], group[kind]) for group in groups if group[kind]["judged"]]
         summary[f"worst_{kind}"] = _worst(judged, pooled)
         summary[f"{kind}_ratio"] = _ratio([rate["value"] for _, rate in judged])
-    return groups, {
-        **summary,
-        "cross_fmr": counted(~same & labelled & ~together),
-        "mixed": int(np.count_nonzero(same & labelled & ~together)),
-        "unlabelled_genuine": int(np.count_nonzero(same & ~labelled)),
-        "unlabelled_impostor": int(np.count_nonzero(~same & ~labelled)),
-    }
+    return groups, summary
 
 
 def fmr_judged(trials: int, target: float) -> bool:

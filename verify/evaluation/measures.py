@@ -41,7 +41,7 @@ def measure(
         "threshold_search": search,
         "accuracies": None if tenth is None else list(tenth.accuracies),
         "thresholds": None if tenth is None else list(tenth.thresholds),
-        "eer": equal_error_rate(genuine, impostor)[0],
+        "eer": equal_error_rate(genuine, impostor),
         "auc": area_under_roc(genuine, impostor),
         "fnmr_at_fmr": {
             f"{target:g}": errors_at(genuine, impostor, target)

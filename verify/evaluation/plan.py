@@ -15,8 +15,7 @@ Json = dict[str, Any]
 Source = DecoyPool | DecoyGenerator
 
 RAW = "raw"
-RAW_FLIP = "raw+flip"
-STRATEGIES = (RAW, RAW_FLIP, *(strategy.value for strategy in Strategy))
+STRATEGIES = (RAW, *(strategy.value for strategy in Strategy))
 DIMS = (2, 4, 8, 16)
 TARGETS = (1e-2, 1e-3, 1e-4)
 
@@ -43,31 +42,17 @@ class EvaluationError(VeilfaceError):
 
 @dataclass(frozen=True)
 class EvaluationPlan:
-    """What is to be evaluated.
+    """What is to be evaluated; everything random is repeated with the seeds from ``seed`` on."""
 
-    Parameters
-    ----------
-    strategies
-        Of ``STRATEGIES``.
-    modes, metrics
-        Of lifted comparisons.
-    shared_decoys
-        Whether both sides draw from the whole pool, instead of each from its own half.
-    repeats, seed
-        Everything random is repeated with the seeds ``seed … seed + repeats − 1``.
-    steps
-        Of the spherical iteration.
-    """
-
-    strategies: tuple[str, ...]
+    strategies: tuple[str, ...]  # of STRATEGIES
     dims: tuple[int, ...] = DIMS
-    modes: tuple[Mode, ...] = (Mode.POINT, Mode.SUBSPACE)
+    modes: tuple[Mode, ...] = (Mode.POINT, Mode.SUBSPACE)  # of lifted comparisons, as metrics
     metrics: tuple[Metric, ...] = (Metric.EUCLIDEAN, Metric.SPHERICAL)
-    shared_decoys: bool = False
+    shared_decoys: bool = False  # both sides draw from the whole pool, not each from its own half
     repeats: int = 5
     seed: int = 0
     targets: tuple[float, ...] = TARGETS
-    steps: int = DEFAULT_STEPS
+    steps: int = DEFAULT_STEPS  # of the spherical iteration
 
     def __post_init__(self) -> None:
         unknown = [name for name in self.strategies if name not in STRATEGIES]
@@ -76,19 +61,8 @@ class EvaluationPlan:
                 f"unknown strategy {', '.join(unknown) or '(none)'}: choose of "
                 f"{', '.join(STRATEGIES)}"
             )
-        for name, values in (
-            ("strategy", self.strategies),
-            ("dimension", self.dims),
-            ("mode", self.modes),
-            ("metric", self.metrics),
-            ("FMR target", self.targets),
-        ):
-            if len(set(values)) != len(values):
-                raise EvaluationError(f"a {name} is named twice")
         if not all(0 < target < 1 for target in self.targets):
             raise EvaluationError("FMR targets lie between 0 and 1, such as 1e-2")
-        if self.repeats < 1:
-            raise EvaluationError("at least one repeat is needed")
 
 
 @dataclass(frozen=True)
@@ -103,13 +77,12 @@ class Unit:
     @property
     def raw(self) -> bool:
         """Whether embeddings are compared as they are."""
-        return self.strategy in (RAW, RAW_FLIP)
+        return self.strategy == RAW
 
 
-def default_strategies(sources: Sequence[Source], *, raw_flip: bool) -> tuple[str, ...]:
+def default_strategies(sources: Sequence[Source]) -> tuple[str, ...]:
     """All strategies that the decoys allow but the sub- ones."""
-    able = {RAW, RAW_FLIP if raw_flip else RAW}
-    able |= {strategy.value for strategy in Strategy if not strategy.needs_decoys}
+    able = {RAW} | {strategy.value for strategy in Strategy if not strategy.needs_decoys}
     if sources:
         able |= {Strategy.ADVERSARIAL, Strategy.HYBRID}
     if any(isinstance(source, DecoyPool) and source.labelled for source in sources):
@@ -121,7 +94,7 @@ def units_of(plan: EvaluationPlan, sources: Sequence[Source], *, n: int) -> list
     """List the units of work, long ones first."""
     units: list[Unit] = []
     for name in plan.strategies:
-        if name in (RAW, RAW_FLIP):
+        if name == RAW:
             units.append(Unit(name))
             continue
         strategy = Strategy(name)
@@ -156,13 +129,11 @@ def _fitting(strategy: Strategy, sources: Sequence[Source]) -> list[int | None]:
         return [None]
     labelled = strategy is Strategy.HYBRID_PLUS
     pools_only = labelled or strategy.sub_databases is not None
-    places: list[int | None] = []
-    for place, source in enumerate(sources):
-        if isinstance(source, DecoyPool):
-            if source.labelled or not labelled:
-                places.append(place)
-        elif not pools_only:
-            places.append(place)
+    places: list[int | None] = [
+        place
+        for place, source in enumerate(sources)
+        if (source.labelled or not labelled if isinstance(source, DecoyPool) else not pools_only)
+    ]
     if not places:
         what = "a pool" if pools_only else "decoys"
         raise EvaluationError(

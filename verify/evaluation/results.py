@@ -17,7 +17,7 @@ from verify.evaluation.experiment import (
 from verify.evaluation.intervals import fmr_grid, percentiles
 from verify.evaluation.labels_file import Labels
 from verify.evaluation.plan import EvaluationPlan, Json
-from verify.evaluation.provenance import Model, software
+from verify.evaluation.provenance import software
 from verify.evaluation.sources import SourceFacts
 from verify.metrics import resolvable, wilson
 from verify.tenfold import FOLDS
@@ -28,7 +28,7 @@ VERSION = 1
 
 def document(
     plan: EvaluationPlan,
-    model: Model,
+    model: Json,
     sources: Sequence[SourceFacts],
     runs: pd.DataFrame,
     results: Sequence[SetResult],
@@ -59,7 +59,7 @@ def document(
                 if result.predicted is not None
             },
         },
-        "model": model.json(),
+        "model": model,
         "decoys": [
             {**source.json(), "file": source.file, "sha256": source.sha256} for source in sources
         ],

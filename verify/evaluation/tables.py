@@ -23,7 +23,6 @@ from verify.evaluation.row_labels import (
     Row,
     datasets_of,
     fmr_targets,
-    order_of,
     strategy_label,
 )
 
@@ -116,9 +115,7 @@ def markdown(results: Mapping[str, Any]) -> str:
     for dataset in results["datasets"]:
         name = dataset["name"]
         rows, summaries, groups = (
-            sorted(
-                (row for row in results[part] if row["dataset"] == dataset["name"]), key=order_of
-            )
+            [row for row in results[part] if row["dataset"] == name]
             for part in ("rows", "group_summaries", "groups")
         )
         parts += [f"## {plain(name)}", *_dataset(dataset, rows)]
@@ -218,7 +215,7 @@ def _group_tables(groups: Sequence[Row], summaries: Sequence[Row]) -> list[str]:
     for attribute, target in dict.fromkeys(map(_judged_at, groups)):
         own = [group for group in groups if _judged_at(group) == (attribute, target)]
         lines = [
-            {**summary, "groups": {g["group"]: g for g in own if order_of(g) == order_of(summary)}}
+            {**summary, "groups": {g["group"]: g for g in own if _cell(g) == _cell(summary)}}
             for summary in summaries
             if _judged_at(summary) == (attribute, target)
         ]
@@ -240,6 +237,11 @@ def _group_tables(groups: Sequence[Row], summaries: Sequence[Row]) -> list[str]:
 
 def _judged_at(entry: Row) -> tuple[str, float]:
     return entry["attribute"], entry["target_fmr"]
+
+
+def _cell(entry: Row) -> list[Any]:
+    """What was compared, of the rows of one data set."""
+    return [entry[name] for name in ("strategy", "decoys", "dim", "mode", "metric")]
 
 
 def _worst(worst: Row | None) -> str:

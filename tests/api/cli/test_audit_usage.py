@@ -68,8 +68,7 @@ def fairface_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def before_any_face(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fail where a face is embedded."""
-    for name in ("embed", "embed_both"):
-        monkeypatch.setattr(ModelPack, name, None)
+    monkeypatch.setattr(ModelPack, "embed", None)
 
 
 def fairface(world: World, root: Path, *more: str | Path) -> Ran:

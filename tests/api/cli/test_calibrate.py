@@ -65,7 +65,6 @@ def test_people_are_left_out_and_ten_fold_adds_a_level(world, veilface, data, tm
     )
     facts = contract.calibration("p2s").calibrated_on
     assert facts["people"] == 48
-    assert facts["excluded_photos"] == 8
     # Half of the people are attacked with the faces of the others.
     assert contract.verdict.privacy.basis["victims"] == 24
     assert contract.calibration("p2s").level("accuracy").target_fmr is None

@@ -10,8 +10,7 @@ from tests.api.cli.conftest import run
 from verify.evaluation import experiment
 
 USAGE: list[tuple[list[str], str]] = [
-    (["--strategy", "homomorphic"], "choose of raw, raw+flip, random"),
-    (["--strategy", "raw,raw"], "named twice"),
+    (["--strategy", "homomorphic"], "choose of raw, random"),
     (["--strategy", ","], "--strategy takes names of strategies, and is empty"),
     (["--strategy", "adversarial"], "make one with `veilface decoys build`"),
     (["--strategy", "hybrid+", "--decoys", "GENERATOR"], "a pool with gender and race labels"),
@@ -26,14 +25,9 @@ USAGE: list[tuple[list[str], str]] = [
     (["--fmr", "low"], "--fmr takes rates such as 1e-2,1e-3, not 'low'"),
     (["--fmr", "1"], "FMR targets lie between 0 and 1, such as 1e-2"),
     (["--fmr", "nan"], "FMR targets lie between 0 and 1, such as 1e-2"),
-    (["--strategy", "raw,raw+flip", "--flip"], "it needs a pack, and no --flip"),
     (["--pack", "none"], "give --pack none --embeddings FILE"),
     (["--embeddings", "EMBEDDINGS"], "give a pack, or --pack none and --embeddings, not both"),
     (["--pack", "none", "--embeddings", "EMBEDDINGS", "--flip"], "--flip needs a pack"),
-    (
-        ["--pack", "none", "--embeddings", "EMBEDDINGS", "--strategy", "raw+flip"],
-        "it needs a pack, and no --flip",
-    ),
     (["LFW"], "two sets have one name (lfw, lfw)"),
     (["--decoys", "POOL", "--decoys", "POOL"], "give one pool and one generator at most"),
     (["--decoys", "POOL", "--dim", "100"], "draws 100 decoys, and one of 2 parts of the pool has"),
@@ -59,8 +53,7 @@ def test_what_cannot_be_done_is_said_before_any_face_is_embedded(
     bench, tmp_path, monkeypatch, arguments, reason, status
 ):
     monkeypatch.setattr(experiment, "evaluate", None)
-    for name in ("embed", "embed_both"):
-        monkeypatch.setattr(ModelPack, name, None)
+    monkeypatch.setattr(ModelPack, "embed", None)
     rows = np.eye(32, dtype=np.float32)
     paths = np.array([f"{i}.png" for i in range(32)])
     np.savez(tmp_path / "embeddings.npz", paths=paths, descriptors=rows)

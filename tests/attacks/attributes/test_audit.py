@@ -23,7 +23,6 @@ def plan(strategy: str, m: int) -> AttributePlan:
     """An audit of a scheme with a pool, of 110 lifting faces and 120 of the attacker's."""
     return AttributePlan(
         schemes=(RAW_SCHEME, Scheme(strategy, "pool", m)),
-        feature_ks=(10,),
         lifting=110,
         attack=120,
         attacked=30,
@@ -166,8 +165,8 @@ def test_no_more_decoys_are_asked_of_a_pool_than_it_gives(strategy: str, most: i
 @pytest.mark.parametrize(
     ("training", "changes", "said"),
     [
-        (120, {}, "10 faces leave 7 in the gallery of a fold, and 10"),
-        (120, {"k": 5, "feature_ks": (5,)}, "a fold of 2 faces is too small to hold some of them"),
+        (120, {}, "10 faces leave 7 in the gallery of a fold, and 50"),
+        (240, {"training_most": 8}, "a fold of 2 faces is too small to hold some of them"),
         (110, {}, "110 lifting faces and 120 for the attacker cannot be taken from 110"),
         (110, {"attack": None}, "110 lifting faces and the others for the attacker cannot be"),
         (240, {"gallery_most": 9}, "leave 9 in the gallery of a fold"),

@@ -10,12 +10,12 @@ from attacks.attributes import experiment
 from attacks.attributes.experiment import run_scheme, trained_on
 from attacks.attributes.faces import Split
 from attacks.attributes.plan import AttributePlan, Setup, prepare
-from attacks.attributes.rows import AttributeRow, strongest
-from attacks.outcomes import GENERATED, POOLED, RAW_SCHEME, AuditError, KnowledgeLevel, Scheme
+from attacks.attributes.rows import AttributeRow
+from attacks.outcomes import GENERATED, POOLED, RAW_SCHEME, KnowledgeLevel, Scheme
 from templates.decoys import DecoyGenerator
 from tests.attacks.attributes.people import faces
 
-PLAN = AttributePlan(schemes=(), lifting=240, feature_ks=(10,), seed=5)
+PLAN = AttributePlan(schemes=(), lifting=240, seed=5)
 ADVERSARIAL = Scheme("adversarial", POOLED, 4)
 PLUS = Scheme("hybrid+", POOLED, 4)
 OURS = Scheme("adversarial", GENERATED, 4)
@@ -173,23 +173,10 @@ def test_a_part_of_the_gallery_teaches_and_all_of_it_votes(scheme: Scheme) -> No
             for row in run_scheme(prepared(SMALL, replace(PLAN, gallery_most=most)), scheme)
             if row.attacker == "knn"
         ]
-        for most in (10_000, 40)
+        for most in (10_000, 60)
     )
     assert [row.confusion for row in one] == [row.confusion for row in other]
     assert [row.held_out for row in one] != [row.held_out for row in other]
-
-
-def test_the_best_attacker_is_chosen_before_the_victims() -> None:
-    rows = attacked(PLUS)
-    chosen = strongest(rows)
-    assert set(chosen) == {
-        (PLUS, attribute, known)
-        for attribute in ("gender", "race")
-        for known in (KnowledgeLevel.ALGORITHM, KnowledgeLevel.DECOYS)
-    }
-    for (_, attribute, known), best in chosen.items():
-        among = [r for r in rows if r.attribute == attribute and r.knowledge == known]
-        assert best.held_out == max(row.held_out for row in among)
 
 
 def on_a_circle(chance: np.random.Generator, *, signal: bool = True) -> experiment.Observed:
@@ -218,12 +205,3 @@ def test_a_trained_attacker_finds_a_rule_and_none_in_noise(
     assert len(at_home) == 400
     said, at_home = trained_on(training, choosing, unseen, "one of four", names)
     assert set(said) | set(at_home) == {2}
-
-
-def test_what_cannot_be_run_is_refused() -> None:
-    small = Split(faces(60, seed=1), faces(40, seed=2), faces(30, seed=3))
-    with pytest.raises(AuditError, match="neighbours are searched for"):
-        prepare(small, plan=replace(PLAN, feature_ks=(50,)))
-    few = prepare(small, plan=PLAN)
-    with pytest.raises(AuditError, match="need a decoy generator"):
-        run_scheme(few, OURS)

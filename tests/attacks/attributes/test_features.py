@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from attacks.attributes.features import Axes, features_of
+from attacks.attributes.features import MOST_NEIGHBOURS, Axes, features_of
 from attacks.attributes.neighbours import nearest_neighbours
 from templates.decoys import DecoyPool
 from templates.keys.randomness import Keystream
@@ -22,8 +22,8 @@ TEMPLATES = lift(
 
 
 def features(templates: SubspaceBatch) -> np.ndarray:
-    near = nearest_neighbours(templates, GALLERY.embeddings, k=20)
-    return features_of(templates, AXES, near, GALLERY, ks=(5, 20))
+    near = nearest_neighbours(templates, GALLERY.embeddings, k=MOST_NEIGHBOURS)
+    return features_of(templates, AXES, near, GALLERY)
 
 
 def test_another_basis_of_the_same_sets_gives_the_same_features() -> None:

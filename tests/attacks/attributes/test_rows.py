@@ -7,7 +7,7 @@ import pytest
 from sklearn.metrics import balanced_accuracy_score, confusion_matrix
 
 from attacks.attributes.rows import AttributeRow, measure
-from attacks.outcomes import RAW_SCHEME, AuditError, KnowledgeLevel
+from attacks.outcomes import RAW_SCHEME, KnowledgeLevel
 from verify.metrics import wilson
 
 CHANCE = np.random.default_rng(5)
@@ -57,8 +57,3 @@ def test_a_rule_turned_round_is_as_strong_and_what_knows_nothing_is_not() -> Non
     blind = against(np.random.default_rng(3).integers(3, size=1500))
     assert blind.accuracy.value < blind.chance - 0.2
     assert blind.strength < 0.03
-
-
-def test_predictions_that_do_not_fit_are_refused() -> None:
-    with pytest.raises(AuditError, match="2 predictions do not fit 3"):
-        against(np.zeros(2, int), np.zeros(3, int))

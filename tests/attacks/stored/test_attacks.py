@@ -9,19 +9,15 @@ from attacks.attack import Attack
 from attacks.bed import Pairs, Testbed
 from attacks.outcomes import AttackOutcome, KnowledgeLevel, Leaked
 from attacks.runner import run_attack
-from attacks.setup import AttackSetup
 from attacks.stored.foot_point import foot_point, foot_points
 from attacks.stored.known_pool import known_pool, pool_owner
 from attacks.stored.linkage import foot_lengths
 from attacks.stored.nearest_neighbour import nearest_neighbour, oracle
-from attacks.stored.second_moments import likeliest, second_moments
+from attacks.stored.second_moments import second_moments
 from attacks.stored.several_templates import mean_of_likeliest, nearest_to_all
 from attacks.stored.stolen_template import renewed_template, stolen_template
 from attacks.stored.wolves import lifted_wolf, wolf_embedding
-from templates.decoys import DecoyGenerator
-from templates.space.lifting import Strategy
 from tests.attacks.beds import (
-    AXES,
     VICTIMS,
     M,
     bed_of,
@@ -77,30 +73,6 @@ def test_the_cosine_of_the_foot_point_is_its_norm() -> None:
     assert np.linalg.norm(found, axis=1) == pytest.approx(1)
     # Six decoys beside the embedding, nearly orthogonal: ‖p‖² ≈ 1/7.
     assert norms.mean() == pytest.approx(7**-0.5, abs=0.05)
-
-
-def test_every_attacker_of_a_verdict_is_reported() -> None:
-    rows = rows_of(second_moments, bed_of())
-    variants = [name for name in rows if "faces" in name and rows[name].leaked != "master key"]
-    assert variants[:5] == [
-        "1,000 faces, photos", "2,456 faces, photos", "860 faces, one photo of each person",
-        "860 faces, the mean of each person", "unlimited faces, exact moments",
-    ]  # fmt: skip
-
-
-@pytest.mark.parametrize(("strategy", "m"), [("adversarial", 6), ("hybrid", 8), ("random", 4)])
-def test_decoys_unlike_the_faces_give_the_embedding_away(strategy: str, m: int) -> None:
-    rng = np.random.default_rng(0)
-    wide = np.where(np.arange(AXES) < 10, 3.0, 1.0)
-    source = DecoyGenerator.fit(unit(rng.normal(size=(2_000, AXES)) * wide))
-    source = source.in_coordinates_of_embeddings()
-    narrow = np.where(np.arange(AXES) < 10, 0.1, 1.0)
-    people = unit(np.random.default_rng(1).normal(size=(800, AXES)) * narrow)
-    setup = AttackSetup.of(Pairs(people[:40], people[:40]), people[40:], source)
-    bed = setup.bed(Strategy(strategy), axes=AXES, m=m)
-    near = np.einsum("ij,ij->i", likeliest(bed, bed.templates), people[:40])
-    least = 0.1 if strategy != "random" else -0.05
-    assert near.mean() > bed.templates.foot_norms.mean() + least
 
 
 def test_a_known_pool_gives_every_decoy_and_its_people_are_accepted() -> None:
@@ -173,10 +145,9 @@ def test_of_templates_that_hide_nothing_the_old_one_opens_the_new_with_its_key_o
 
 def test_wolves_open_few() -> None:
     wolves = rows_of(wolf_embedding, bed_of()) | rows_of(lifted_wolf, bed_of())
-    assert wolves["axes through the origin"].details["refused_by_the_input_checks"] == 1
     assert all(row.measured.value < 0.1 for row in wolves.values())
     assert all(row.leaked is Leaked.DATABASE for row in wolves.values())
-    assert len(wolves) == 3
+    assert len(wolves) == 2
 
 
 def test_templates_do_not_link_in_secret_rotations() -> None:

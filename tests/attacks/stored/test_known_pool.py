@@ -42,15 +42,6 @@ def test_all_decoys_and_no_others_are_found_and_the_embedding_is_left(
     assert np.einsum("ij,ij->i", rest, VICTIMS).mean() > 0.9
 
 
-def test_another_pool_finds_nothing_and_leaves_the_foot_point() -> None:
-    templates = lifted("adversarial", 4)
-    other = faces(150, seed=9, n=256).embeddings
-    decoys = find_decoys(templates, other, most=4)
-    assert not decoys.inside.any()
-    feet = templates.feet / np.linalg.norm(templates.feet, axis=1, keepdims=True)
-    np.testing.assert_allclose(strip(templates, other, decoys), feet, atol=1e-6)
-
-
 def test_the_face_itself_is_no_decoy() -> None:
     pool = np.vstack([ENTRIES, VICTIMS])
     own = 150 + np.arange(30)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from attacks.stored.nearest_neighbour import best_of, nearest_entries, nearest_points
+from attacks.stored.nearest_neighbour import nearest_entries, nearest_points
 from attacks.stored.stolen_template import flats_inside, points_inside
 from templates.distances import Metric, paired_distances
 from tests.attacks.beds import AXES, bed_of, noise
@@ -49,12 +49,3 @@ def test_the_nearest_point_is_a_unit_vector_of_the_template_and_the_best_one() -
         assert templates[row].contains(found[row], tol=2e-3)
         drawn = nearest_points(rng.standard_normal((200, AXES)), templates[[row] * 200])
         assert (drawn @ points[row]).max() <= found[row] @ points[row] + 1e-6
-
-
-def test_the_oracle_names_the_nearest_of_the_neighbours() -> None:
-    gallery, truth = noise(30, 12), noise(3, 12, seed=1)
-    entries = np.array([[0, 5, 9], [1, 2, 3], [29, 4, 6]])
-    best = best_of(gallery, entries, truth)
-    for row in range(3):
-        distances = [np.linalg.norm(gallery[entry] - truth[row]) for entry in entries[row]]
-        assert np.array_equal(best[row], gallery[entries[row][int(np.argmin(distances))]])

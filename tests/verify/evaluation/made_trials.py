@@ -34,7 +34,6 @@ def made_trials(
     return Trials(
         name="made",
         embeddings=rows,
-        mirrored=None,
         first=(2 * first).astype(np.int64),
         second=(2 * second + 1).astype(np.int64),
         same=same,

@@ -5,18 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from models.cache import EmbeddingCache
 from models.decoding import decode_image
 from models.demo import build_demo_pack
 from models.extraction import Photo
 from models.pack import ModelPack
 from models.synthetic import draw_face, encode_photo
-from verify.evaluation.embedding import (
-    EmbeddedSet,
-    FileEmbedder,
-    PackEmbedder,
-    are_aligned,
-)
+from verify.evaluation.embedding import FileEmbedder, PackEmbedder, are_aligned
 from verify.evaluation.embeddings_file import EmbeddingsFile
 from verify.evaluation.verification_set import VerificationSet, contiguous_folds
 
@@ -69,40 +63,27 @@ def mixed(tmp_path: Path) -> VerificationSet:
     )
 
 
-def acquired(
-    pairs: VerificationSet,
-    pack: ModelPack,
-    *,
-    cache: EmbeddingCache | None = None,
-    seen: list[int] | None = None,
-) -> EmbeddedSet:
-    steps = [] if seen is None else seen
+def test_every_picture_has_a_row_or_a_reason(mixed: VerificationSet, pack: ModelPack) -> None:
+    seen: list[int] = []
 
     @contextmanager
     def progress(_: str, total: int) -> Iterator[Callable[[int], None]]:
-        steps.append(total)
-        yield steps.append
+        seen.append(total)
+        yield seen.append
 
-    embedder = PackEmbedder(pack, {}, mirrored=False, aligned=True)
-    return embedder.embed(pairs, cache=cache, progress=progress)
-
-
-def check_mixed(found: EmbeddedSet, pack: ModelPack) -> None:
+    embedder = PackEmbedder(pack, {}, aligned=True)
+    found = embedder.embed(mixed, cache=None, progress=progress)
     crops = [decode_image(FACES[number]) for number in (0, 0, 1, 2, 2)]
     alone = np.concatenate([pack.embed(crop[None]) for crop in crops])
     np.testing.assert_array_equal(found.rows, [0, -1, 1, 2, -1, 3, 4, -1, -1])
     np.testing.assert_allclose(found.embeddings, alone, atol=1e-6)
     np.testing.assert_allclose(np.linalg.norm(found.embeddings, axis=1), 1, atol=1e-6)
-    names = [failure.path.as_posix() for failure in found.failures]
-    assert names == ["broken", "broken too", "Cas/3.png", "Cas/4.png"]
-    assert [failure.code for failure in found.failures[:2]] == ["unsupported_image"] * 2
-
-
-def test_every_picture_has_a_row_or_a_reason(mixed: VerificationSet, pack: ModelPack) -> None:
-    seen: list[int] = []
-    found = acquired(mixed, pack, seen=seen)
-    check_mixed(found, pack)
-    assert [failure.code for failure in found.failures[2:]] == ["unreadable_file"] * 2
+    assert [(failure.path.as_posix(), failure.code) for failure in found.failures] == [
+        ("broken", "unsupported_image"),
+        ("broken too", "unsupported_image"),
+        ("Cas/3.png", "unreadable_file"),
+        ("Cas/4.png", "unreadable_file"),
+    ]
     assert seen == [9, 9]
 
 

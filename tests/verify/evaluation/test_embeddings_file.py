@@ -64,12 +64,12 @@ ZERO = ROWS * np.array([[1], [0], [1]])
         ({"paths": PATHS[:2], "descriptors": ROWS}, "expected .N,. and .N, n."),
         ({"paths": PATHS, "descriptors": ROWS[0]}, "expected .N,. and .N, n."),
         ({"paths": PATHS[:0], "descriptors": ROWS[:0]}, "expected .N,."),
-        ({"paths": PATHS, "descriptors": ROWS.astype(int)}, "descriptors is of type int64"),
+        ({"paths": PATHS, "descriptors": ROWS.astype(int)}, "descriptors of type int64"),
         (
             {"paths": PATHS, "descriptors": ROWS.astype(complex)},
-            "descriptors is of type complex128",
+            "descriptors of type complex128",
         ),
-        ({"paths": PATHS.astype("S"), "descriptors": ROWS}, r"paths is of type \|S1"),
+        ({"paths": PATHS.astype("S"), "descriptors": ROWS}, r"paths are of type \|S1"),
         (
             {"paths": PATHS.astype(object), "descriptors": ROWS},
             "not a readable .npz archive .ValueError",
@@ -128,7 +128,7 @@ def test_lfw_names(paths: list[str], expected: list[int]) -> None:
     [
         ("lfw", NAMES, ["x/Ann/Ann_0001.jpg", "y/Ann/Ann_0001.jpg"], "Ann_0001.jpg may be 'x/Ann"),
         ("lfw", NAMES, ["Ann/Ann_0001.png", "Ann/Ann_0001.webp"], "Ann_0001.jpg may be"),
-        ("pairs", ["a/1.jpg"], ["x/a/1.jpg", "y/a/1.jpg"], "a/1.jpg may be 'x/a/1.jpg' and"),
+        ("pairs", ["a/1.jpg"], ["x/a/1.jpg", "y/a/1.jpg"], "a/1.jpg may be 'x/a/1.jpg' or"),
     ],
 )
 def test_ambiguous_names(kind: str, names: list[str], paths: list[str], message: str) -> None:

@@ -52,11 +52,6 @@ def test_every_trial_is_counted_once():
     groups, summary = report(*TWO_GROUPS)
     found = {group["group"]: (counts(group["fmr"]), counts(group["fnmr"])) for group in groups}
     assert found == {"Female": ((15, 300), (10, 200)), "Male": ((3, 1200), (4, 400))}
-    assert counts(summary["cross_fmr"]) == (3, 1003)
-    missing = [summary[name] for name in ("mixed", "unlabelled_genuine", "unlabelled_impostor")]
-    assert missing == [3, 6, 8]
-    assert counts(summary["overall_fmr"]) == (22, 2511)
-    assert counts(summary["overall_fnmr"]) == (15, 609)
     assert counts(summary["pooled_fmr"]) == (18, 1500)
     assert counts(summary["pooled_fnmr"]) == (14, 600)
     json.dumps([groups, summary], allow_nan=False)
@@ -85,16 +80,6 @@ def test_a_worst_group_is_apart_where_its_widened_interval_is_above_all(errors, 
     assert (low > pooled) == apart
     assert summary["worst_fnmr"]["group"] == "a"
     assert summary["worst_fnmr"]["apart"] == apart
-
-
-def test_the_interval_is_widened_for_the_number_of_groups():
-    """Apart at 95 %, but not as the highest of eight."""
-    others = [trials(True, name, name, 990, 10) for name in "bcdefgh"]
-    _, summary = report(trials(True, "a", "a", 980, 20), *others)
-    pooled = summary["pooled_fnmr"]["value"]
-    assert binomtest(20, 1000).proportion_ci(0.95, method="wilson").low > pooled
-    assert summary["worst_fnmr"]["group"] == "a"
-    assert not summary["worst_fnmr"]["apart"]
 
 
 @pytest.mark.parametrize("target", [0.01, 0.001, 0.003])

@@ -60,12 +60,3 @@ def test_figures_equal_those_of_independent_code(seed: int) -> None:
         # No lower threshold keeps the target.
         lower = other[other < at["threshold"]].max()
         assert np.count_nonzero(other >= lower) / other.size > float(target)
-
-
-def test_without_folds_there_are_error_rates_and_no_accuracy() -> None:
-    similarities, same = scores_of(200, 1)
-    found = measure(similarities, same, None, targets=(0.05,))
-    folded = measure(similarities, same, contiguous_folds(200), targets=(0.05,))
-    assert (found["accuracies"], found["thresholds"]) == (None, None)
-    assert found["fnmr_at_fmr"] == folded["fnmr_at_fmr"]
-    assert found["eer"] == folded["eer"]

@@ -37,9 +37,7 @@ def test_a_strategy_without_its_decoys_is_refused(
     [
         ({"strategies": ("lifted",)}, "unknown strategy lifted: choose of raw"),
         ({"strategies": ()}, "unknown strategy"),
-        ({"dims": (2, 2)}, "dimension is named twice"),
         ({"targets": (2.0,)}, "between 0 and 1"),
-        ({"repeats": 0}, "at least one repeat"),
     ],
 )
 def test_a_plan_that_cannot_be_is_refused(changes: dict, message: str) -> None:

@@ -23,7 +23,6 @@ from verify.evaluation.row_labels import (
     METRIC_NAMES,
     Row,
     datasets_of,
-    order_of,
     raw_row,
     strategy_label,
 )
@@ -49,7 +48,7 @@ def verification_figure(results: Mapping[str, Any]) -> Figure | None:
     """
     rows = [
         row
-        for row in sorted(results["rows"], key=order_of)
+        for row in results["rows"]
         if row["mode"] in MODE_TITLES and row["accuracy_mean"] is not None
     ]
     if not rows:

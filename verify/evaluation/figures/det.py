@@ -26,8 +26,6 @@ from verify.evaluation.row_labels import (
     MODE_NAMES,
     Row,
     datasets_of,
-    order_of,
-    preferred_metric,
     strategy_label,
 )
 
@@ -84,7 +82,8 @@ def det_figure(results: Mapping[str, Any]) -> Figure | None:
 def shown_curves(curves: Sequence[Row], mode: str) -> list[Row]:
     """Return the curves of one panel, out of those of one data set, in the order of the tables."""
     lifted = [curve for curve in curves if curve["mode"] == mode and mode in LIFTED_MODES]
-    metric = preferred_metric(lifted)
+    metrics = {curve["metric"] for curve in lifted}
+    metric = "spherical" if "spherical" in metrics else "euclidean"
     lifted = [curve for curve in lifted if curve["metric"] == metric]
     by_group: dict[str, set[int]] = {}
     for curve in lifted:
@@ -93,7 +92,7 @@ def shown_curves(curves: Sequence[Row], mode: str) -> list[Row]:
     ends = {label: {min(shared or dims), max(shared or dims)} for label, dims in by_group.items()}
     lifted = [curve for curve in lifted if int(curve["dim"]) in ends[strategy_label(curve)]]
     raw = [curve for curve in curves if curve["strategy"] == "raw"]
-    return sorted(raw + lifted, key=order_of)
+    return raw + lifted
 
 
 def _legend(figure: Figure) -> None:

@@ -1,55 +1,43 @@
 """The document of a liveness evaluation, ``results.json``, and its report in Markdown."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 
 from models.liveness import PassiveLiveness
 from templates.contract.document import Contract
 from templates.contract.levels import Rate
-from verify.evaluation.liveness.rates import apcer, bpcer, non_response
 from verify.evaluation.liveness.scores import ScoredSet, VerifiedSet
 from verify.evaluation.markdown_cells import (
     code,
     count,
     interval_cell,
-    percent,
     plain,
     significant,
     table,
 )
 from verify.evaluation.plan import Json
-from verify.evaluation.provenance import Model, software
+from verify.evaluation.provenance import software
 from verify.evaluation.tables import Cells, failure_list
-from verify.metrics import equal_error_rate
 
 FORMAT = "veilface liveness evaluation"
 VERSION = 1
 CONTRACT_POINT = "contract"
-
-
-@dataclass(frozen=True)
-class OperatingPoint:
-    """A threshold and where it comes from: ``contract``, or ``bpcer-0.05`` of these photos."""
-
-    name: str
-    threshold: float
+"""Name of the operating point at the contract's threshold."""
 
 
 def document(
     scored: ScoredSet,
-    model: Model,
+    model: Json,
     liveness: PassiveLiveness,
-    points: Sequence[OperatingPoint],
+    points: Mapping[str, float],
     *,
     contract: Contract | None,
     verified: VerifiedSet | None,
     unverified: str | None,
     refused: Sequence[str],
 ) -> Json:
-    """Put everything together."""
+    """Put everything together; ``points`` are thresholds by the names of their operating points."""
     presented = scored.presented
     species = [name for name in presented.species if len(scored.scored(name))]
-    live = scored.scored(None)
     verification: Json = {"measured": False, "reason": unverified}
     if verified is not None:
         verification = {
@@ -66,7 +54,7 @@ def document(
         "format": FORMAT,
         "version": VERSION,
         "software": software(),
-        "model": {**model.json(), "liveness": [graph.as_dict() for graph in liveness.members]},
+        "model": {**model, "liveness": [graph.as_dict() for graph in liveness.members]},
         "contract": contract and {"contract_id": contract.contract_id, "liveness": policy},
         "dataset": {
             "name": presented.name,
@@ -74,15 +62,18 @@ def document(
             "subjects": presented.subjects,
             "live": len(scored.rows(None)),
             "attacks": {name: len(scored.rows(name)) for name in presented.species},
-            "bpnrr": _rate(non_response(scored, None)),
-            "apnrr": {name: _rate(non_response(scored, name)) for name in presented.species},
+            "bpnrr": _rate(scored.non_response(None)),
+            "apnrr": {name: _rate(scored.non_response(name)) for name in presented.species},
         },
         "failures": [
             {"image": failure.path.name, "code": failure.code, "reason": failure.reason}
             for failure in scored.failures
         ],
-        "rows": [row for point in points for row in _rows(scored, species, point, verified)],
-        "eer": {name: equal_error_rate(live, scored.scored(name))[0] for name in species},
+        "rows": [
+            row
+            for point, threshold in points.items()
+            for row in _rows(scored, species, point, threshold, verified)
+        ],
         "verification": verification,
         "refused": list(refused),
     }
@@ -91,25 +82,25 @@ def document(
 def _rows(
     scored: ScoredSet,
     species: Sequence[str],
-    point: OperatingPoint,
+    point: str,
+    threshold: float,
     verified: VerifiedSet | None,
 ) -> list[Json]:
     """Errors of one operating point: a row for each species, the worst marked."""
-    passed = {name: apcer(scored, name, point.threshold) for name in species}
+    passed = {name: scored.apcer(name, threshold) for name in species}
     worst = max(species, key=lambda name: passed[name].value)
-    rejected = bpcer(scored, point.threshold)
     return [
         {
             "dataset": scored.presented.name,
-            "operating_point": point.name,
-            "threshold": point.threshold,
+            "operating_point": point,
+            "threshold": threshold,
             "species": name,
             "worst": name == worst,
             "apcer": _rate(passed[name]),
-            "bpcer": _rate(rejected),
+            "bpcer": _rate(scored.bpcer(threshold)),
             "iapmr_without_liveness": verified and _rate(verified.iapmr(name, None)),
-            "iapmr": verified and _rate(verified.iapmr(name, point.threshold)),
-            "frr": verified and _rate(verified.false_rejections(point.threshold)),
+            "iapmr": verified and _rate(verified.iapmr(name, threshold)),
+            "frr": verified and _rate(verified.false_rejections(threshold)),
         }
         for name in species
     ]
@@ -163,7 +154,6 @@ HOW_TO_READ = """## How to read this
 - APCER: share of the attack photos of one species that are taken for live. The worst species is the headline, since an attacker chooses. BPCER: share of the live photos that are taken for attacks. ISO/IEC 30107-3.
 - In brackets the 95 % interval: people are resampled where they are known (never narrower than Wilson's), else Wilson's, as if the photos were independent. In parentheses errors of photos.
 - A threshold that was set on these very photos flatters: apply one of other photos, `--contract`.
-- D-EER: where APCER and BPCER are equal, or nearest to it.
 - IAPMR (IAPAR, its rate of acceptance by the full system, in ISO/IEC 30107-3:2023): share of the attacks with a photo of an enrolled person that the whole verification accepts for that person; a photo without a face is not accepted.
 - Another camera, light or attack gives other rates (docs/liveness.md)."""  # noqa: E501
 
@@ -210,13 +200,14 @@ def _through(facts: Json) -> str:
 
 def _non_responses(results: Json) -> list[str]:
     dataset = results["dataset"]
-    lines = [["live (BPNRR)", interval_cell(dataset["bpnrr"]), ""]]
-    lines += [
-        [f"{plain(name)} (APNRR)", interval_cell(rate), percent(results["eer"].get(name))]
-        for name, rate in dataset["apnrr"].items()
-    ]
+    rates = {"live (BPNRR)": dataset["bpnrr"]}
+    rates |= {f"{plain(name)} (APNRR)": rate for name, rate in dataset["apnrr"].items()}
     return [
         "They have no score, and are in neither APCER nor BPCER.",
-        table(["photos", "without a face %", "D-EER %"], lines, [True, False, False]),
+        table(
+            ["photos", "without a face %"],
+            [[name, interval_cell(rate)] for name, rate in rates.items()],
+            [True, False],
+        ),
         *([failure_list(results["failures"])] if results["failures"] else []),
     ]

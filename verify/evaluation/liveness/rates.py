@@ -1,17 +1,10 @@
-"""Error rates of presentation attack detection, and thresholds for a stated BPCER.
-
-Terms of ISO/IEC 30107-3. A presentation is taken for live where its score is at or above the
-threshold. APCER is of one attack species at a time, and the worst is the headline: an attacker
-chooses. Photos in which no face was found have no score; they are counted apart, as non-responses.
-"""
+"""Liveness thresholds for a stated BPCER (ISO/IEC 30107-3)."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from templates.contract.levels import Rate
 from templates.contract.liveness import LivenessCalibration
 from verify.datasets import DatasetError
 from verify.evaluation.liveness.scores import ScoredSet
@@ -33,21 +26,6 @@ def threshold_at_bpcer(live: ArrayLike, target: float) -> float:
     return -threshold_at_fmr(-scores, target)
 
 
-def bpcer(scored: ScoredSet, threshold: float) -> Rate:
-    """Share of the live photos with a face that are taken for attacks."""
-    return scored.rate(None, scored.scores < threshold, among=scored.acquired)
-
-
-def apcer(scored: ScoredSet, species: str, threshold: float) -> Rate:
-    """Share of the attack photos of one species with a face that are taken for live."""
-    return scored.rate(species, scored.scores >= threshold, among=scored.acquired)
-
-
-def non_response(scored: ScoredSet, species: str | None) -> Rate:
-    """Share of the photos of one species (APNRR), or of the live ones (BPNRR), without a face."""
-    return scored.rate(species, ~scored.acquired, among=np.ones_like(scored.acquired))
-
-
 def calibrate_liveness(
     scored: ScoredSet, graphs: Sequence[str], *, target: float
 ) -> LivenessCalibration:
@@ -56,23 +34,19 @@ def calibrate_liveness(
     return LivenessCalibration(
         graphs=tuple(graphs),
         threshold=threshold,
-        bpcer=bpcer(scored, threshold),
+        bpcer=scored.bpcer(threshold),
         target_bpcer=target,
         apcer={
-            name: apcer(scored, name, threshold)
+            name: scored.apcer(name, threshold)
             for name in scored.presented.species
             if len(scored.scored(name))
         },
-        calibrated_on=_counts(scored),
-    )
-
-
-def _counts(scored: ScoredSet) -> dict[str, Any]:
-    return {
-        "dataset": scored.presented.name,
-        "subjects": scored.presented.subjects,
-        "live_without_face": non_response(scored, None).errors,
-        "attacks_without_face": {
-            name: non_response(scored, name).errors for name in scored.presented.species
+        calibrated_on={
+            "dataset": scored.presented.name,
+            "subjects": scored.presented.subjects,
+            "live_without_face": scored.non_response(None).errors,
+            "attacks_without_face": {
+                name: scored.non_response(name).errors for name in scored.presented.species
+            },
         },
-    }
+    )

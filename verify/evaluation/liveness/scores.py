@@ -1,4 +1,9 @@
-"""Liveness scores of a set of presentations, and what gave none."""
+"""Liveness scores of a set of presentations, and the error rates that they give.
+
+Terms of ISO/IEC 30107-3. A presentation is taken for live where its score is at or above the
+threshold. APCER is of one attack species at a time, and the worst is the headline: an attacker
+chooses. Photos in which no face was found have no score; they are counted apart, as non-responses.
+"""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -66,6 +71,18 @@ class ScoredSet:
         scores = self.scores[self.rows(species)]
         return scores[np.isfinite(scores)]
 
+    def bpcer(self, threshold: float) -> Rate:
+        """Share of the live photos with a face that are taken for attacks."""
+        return self.rate(None, self.scores < threshold, among=self.acquired)
+
+    def apcer(self, species: str, threshold: float) -> Rate:
+        """Share of the attack photos of one species with a face that are taken for live."""
+        return self.rate(species, self.scores >= threshold, among=self.acquired)
+
+    def non_response(self, species: str | None) -> Rate:
+        """Share of the photos of one species (APNRR), or the live ones (BPNRR), without a face."""
+        return self.rate(species, ~self.acquired, among=np.ones_like(self.acquired))
+
     def rate(self, species: str | None, wrong: Flags, *, among: Flags) -> Rate:
         """Share of one species that went wrong, among those that are asked about; both (k,)."""
         rows = [row for row in self.rows(species) if among[row]]
@@ -123,24 +140,15 @@ def score_set(
             reason = f"The file cannot be read: {error.strerror}."
             return Failure(presentation.path, "unreadable_file", reason)
 
-    results: list[FaceSample | Failure] = []
-    with ThreadPoolExecutor(default_workers()) as pool:
-        for result in pool.map(sample, presented.presentations):
-            results.append(result)
-            progress(1)
-    return _scored(presented, results, n=pack.info.n)
-
-
-def _scored(
-    presented: PresentationSet, results: Sequence[FaceSample | Failure], *, n: int
-) -> ScoredSet:
-    scores = np.full(len(results), np.nan)
-    embeddings = np.zeros((len(results), n), np.float32)
+    scores = np.full(len(presented.presentations), np.nan)
+    embeddings = np.zeros((len(scores), pack.info.n), np.float32)
     failures = []
-    for row, result in enumerate(results):
-        if isinstance(result, Failure):
-            failures.append(result)
-        elif result.liveness is not None:
-            scores[row] = result.liveness
-            embeddings[row] = result.embedding
+    with ThreadPoolExecutor(default_workers()) as pool:
+        for row, result in enumerate(pool.map(sample, presented.presentations)):
+            if isinstance(result, Failure):
+                failures.append(result)
+            elif result.liveness is not None:
+                scores[row] = result.liveness
+                embeddings[row] = result.embedding
+            progress(1)
     return ScoredSet(presented, scores, embeddings, tuple(failures))

@@ -24,12 +24,6 @@ def open_sets(path: Path, *, pictures: bool = True) -> list[VerificationSet]:
         if not path.exists():
             raise DatasetError(f"{path} is not there. {understood}")
         able = [reader for reader in readers if reader.recognises(path)]
-        if not able and path.is_dir():
-            # An archive that was unpacked into a folder of its own.
-            inside = sorted(one for one in path.iterdir() if one.is_dir() and one.name[0] != ".")
-            if len(inside) == 1:
-                path = inside[0]
-                able = [reader for reader in readers if reader.recognises(path)]
         if len(able) == 1:
             return able[0].read(path, pictures)
         if able:

@@ -7,13 +7,7 @@ from hypothesis import strategies as st
 
 from tests.verify.evaluation.liveness.sets import scored_set
 from verify.datasets import DatasetError
-from verify.evaluation.liveness.rates import (
-    apcer,
-    bpcer,
-    calibrate_liveness,
-    non_response,
-    threshold_at_bpcer,
-)
+from verify.evaluation.liveness.rates import calibrate_liveness, threshold_at_bpcer
 from verify.evaluation.liveness.scores import VerifiedSet, share
 from verify.metrics import wilson
 
@@ -30,13 +24,23 @@ STATED = [
 
 def test_rates_of_a_stated_set():
     scored = scored_set(STATED)
-    assert (bpcer(scored, 0.7).errors, bpcer(scored, 0.7).trials) == (1, 4)
-    # At the threshold is live, of a live face as of an attack.
-    assert (apcer(scored, "print", 0.7).errors, apcer(scored, "print", 0.7).trials) == (1, 2)
-    assert (apcer(scored, "mask", 0.7).errors, apcer(scored, "mask", 0.7).trials) == (1, 2)
-    assert (non_response(scored, None).errors, non_response(scored, None).trials) == (1, 5)
-    assert (non_response(scored, "print").errors, non_response(scored, "print").trials) == (1, 3)
-    assert non_response(scored, "mask").errors == 0
+    rates = {
+        "bpcer": scored.bpcer(0.7),
+        # At the threshold is live, of a live face as of an attack.
+        "print": scored.apcer("print", 0.7),
+        "mask": scored.apcer("mask", 0.7),
+        "bpnrr": scored.non_response(None),
+        "apnrr of print": scored.non_response("print"),
+        "apnrr of mask": scored.non_response("mask"),
+    }
+    assert {name: (rate.errors, rate.trials) for name, rate in rates.items()} == {
+        "bpcer": (1, 4),
+        "print": (1, 2),
+        "mask": (1, 2),
+        "bpnrr": (1, 5),
+        "apnrr of print": (1, 3),
+        "apnrr of mask": (0, 2),
+    }
 
 
 @given(
