@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import limits
-from pydantic import Field, ValidationError, ValidationInfo, field_validator
+from pydantic import BeforeValidator, Field, ValidationError, ValidationInfo, field_validator
 from pydantic_settings import (
     BaseSettings,
     NoDecode,
@@ -41,15 +41,21 @@ _ORIGIN = re.compile(
 )
 
 
+def _parts(value: Any) -> Any:
+    """Split a text at its commas; anything else is returned."""
+    if not isinstance(value, str):
+        return value
+    return tuple(part.strip() for part in value.split(",") if part.strip())
+
+
 def config_file() -> Path | None:
     """Path of the TOML file in force, or None."""
     named = os.environ.get(CONFIG_VARIABLE)
-    if named:
-        path = Path(named)
-        if not path.is_file():
-            raise StartError(f"{CONFIG_VARIABLE} names {path}, which is not a file")
-        return path
-    return DEFAULT_CONFIG_FILE if DEFAULT_CONFIG_FILE.is_file() else None
+    if not named:
+        return DEFAULT_CONFIG_FILE if DEFAULT_CONFIG_FILE.is_file() else None
+    if not Path(named).is_file():
+        raise StartError(f"{CONFIG_VARIABLE} names {named}, which is not a file")
+    return Path(named)
 
 
 class LivenessPolicy(StrEnum):
@@ -111,8 +117,9 @@ class Settings(BaseSettings):
         description="Model pack: a folder of ONNX files, or one embedder file. Unset: the "
         "service accepts templates and embeddings only.",
     )
-    providers: Annotated[tuple[str, ...], NoDecode] = Field(
+    providers: Annotated[tuple[str, ...], NoDecode, BeforeValidator(_parts)] = Field(
         ("cpu",),
+        min_length=1,
         description="ONNX Runtime providers in order of preference, separated by commas. One "
         "that is absent is an error.",
     )
@@ -178,6 +185,7 @@ class Settings(BaseSettings):
     )
     rate_limit_storage: str = Field(
         "memory://",
+        pattern=r"^(memory://$|rediss?://)",
         description="Where requests are counted. `memory://`: in each worker for itself, so that "
         "up to `workers` times the limit may pass. `redis://USER:PASSWORD@HOST/NUMBER` or "
         "`rediss://…`: in one place, for all workers and hosts; needs `veilface[redis]`.",
@@ -243,18 +251,6 @@ class Settings(BaseSettings):
     )
     demo: bool = Field(False, description="Say in every answer that the pack is the demo model.")
 
-    @field_validator("providers", mode="before")
-    @classmethod
-    def _split_providers(cls, value: Any) -> Any:
-        if isinstance(value, str):
-            value = [part.strip() for part in value.split(",")]
-        if isinstance(value, list | tuple):
-            names = tuple(value)
-            if not names or not all(isinstance(name, str) and name for name in names):
-                raise ValueError("name at least one provider, for example cpu")
-            return names
-        return value
-
     @field_validator("database_url")
     @classmethod
     def _known_database(cls, value: str | None) -> str | None:
@@ -262,11 +258,11 @@ class Settings(BaseSettings):
         from templates.errors import StoreError
         from templates.store.engine import checked_url
 
-        if value:
-            try:
+        try:
+            if value:
                 checked_url(value)
-            except StoreError as error:
-                raise ValueError(str(error)) from None
+        except StoreError as error:
+            raise ValueError(str(error)) from None
         return value
 
     @field_validator("rate_limit_key", "rate_limit_address")
@@ -278,32 +274,22 @@ class Settings(BaseSettings):
         try:
             (limit,) = limits.parse_many(value)
         except ValueError:
-            raise ValueError("write one COUNT/second, minute, hour or day, or off") from None
-        if limit.amount < 1:
-            raise ValueError("allow at least one request, or write off")
-        return value
-
-    @field_validator("rate_limit_storage")
-    @classmethod
-    def _known_storage(cls, value: str) -> str:
-        if value != "memory://" and not value.startswith(("redis://", "rediss://")):
-            raise ValueError("must be memory:// or begin with redis:// or rediss://")
+            limit = None
+        if limit is None or limit.amount < 1:
+            raise ValueError("write one COUNT/second, minute, hour or day, of at least one, or off")
         return value
 
     @field_validator("trusted_proxies")
     @classmethod
     def _known_proxies(cls, value: str) -> str:
-        names = [part.strip() for part in value.split(",") if part.strip()]
-        if not names:
-            return NO_PROXIES
-        if value.strip() not in ("*", NO_PROXIES):
-            for name in names:
-                try:
-                    ipaddress.ip_network(name)
-                except ValueError:
-                    raise ValueError(
-                        "list IP addresses or networks, separated by commas, or write none or *"
-                    ) from None
+        names = _parts(value) or (NO_PROXIES,)
+        try:
+            if names not in (("*",), (NO_PROXIES,)):
+                list(map(ipaddress.ip_network, names))
+        except ValueError:
+            raise ValueError(
+                "list IP addresses or networks, separated by commas, or write none or *"
+            ) from None
         return ",".join(names)
 
     @field_validator("root_path")
@@ -319,10 +305,8 @@ class Settings(BaseSettings):
     @field_validator("cors_origins")
     @classmethod
     def _known_origins(cls, value: str) -> str:
-        origins = [part.strip() for part in value.split(",") if part.strip()]
-        if not origins or origins == [NONE]:
-            return NONE
-        if not all(map(_ORIGIN.fullmatch, origins)):
+        origins = _parts(value) or (NONE,)
+        if origins != (NONE,) and not all(map(_ORIGIN.fullmatch, origins)):
             raise ValueError(
                 "list origins as browsers send them, separated by commas: https://HOST or "
                 "https://HOST:PORT, in lower case, without a path, the scheme's own port or *"
@@ -344,20 +328,16 @@ class Settings(BaseSettings):
         return value
 
     @classmethod
-    def settings_customise_sources(
+    def settings_customise_sources(  # type: ignore[override]
         cls,
         settings_cls: type[BaseSettings],
         init_settings: PydanticBaseSettingsSource,
         env_settings: PydanticBaseSettingsSource,
-        dotenv_settings: PydanticBaseSettingsSource,  # noqa: ARG003 - the base's signature
-        file_secret_settings: PydanticBaseSettingsSource,  # noqa: ARG003
+        **_: PydanticBaseSettingsSource,
     ) -> tuple[PydanticBaseSettingsSource, ...]:
         """Order the sources: flags, then the environment, then the TOML file."""
-        return (
-            init_settings,
-            env_settings,
-            TomlConfigSettingsSource(settings_cls, toml_file=config_file()),
-        )
+        file = TomlConfigSettingsSource(settings_cls, toml_file=config_file())
+        return init_settings, env_settings, file
 
     @property
     def resolved_database_url(self) -> str:

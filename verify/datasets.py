@@ -4,7 +4,7 @@ import csv
 import hashlib
 import io
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -33,17 +33,27 @@ class LabelledFolder:
 
     def without(self, people: Collection[str]) -> "LabelledFolder":
         """Leave people out, by their names."""
-        kept = [place for place, name in enumerate(self.identities) if name not in people]
-        return replace(
-            self,
-            paths=tuple(self.paths[place] for place in kept),
-            identities=tuple(self.identities[place] for place in kept),
-        )
+        return self.having({name: a for name, a in self.albums.items() if name not in people})
 
     @property
     def people(self) -> int:
         """Number of different names."""
         return len(set(self.identities))
+
+    @property
+    def albums(self) -> dict[str, list[Path]]:
+        """Photos by the name of their person."""
+        albums: dict[str, list[Path]] = {}
+        for path, name in zip(self.paths, self.identities, strict=True):
+            albums.setdefault(name, []).append(path)
+        return albums
+
+    def having(self, albums: Mapping[str, Sequence[Path]]) -> "LabelledFolder":
+        """Return the folder with these photos of these people."""
+        pairs = [(path, name) for name, album in albums.items() for path in album]
+        return replace(
+            self, paths=tuple(p for p, _ in pairs), identities=tuple(n for _, n in pairs)
+        )
 
 
 def visible(folder: Path) -> list[Path]:

@@ -1,18 +1,18 @@
 """``veilface audit-log``: who did what, and whether the log is whole."""
 
 import json
-from itertools import chain, islice
+from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from api.cli.console import message, progress, say_lines
+from api.cli.console import progress, say
 from api.cli.errors import UsageError
 from api.cli.files import read_bounded
-from api.cli.options import STORE, takes_settings
-from api.cli.public_key import PublicKey, read_public_key
-from api.cli.results import Result, reports
+from api.cli.options import STORE, reports
+from api.cli.results import Result
+from api.cli.store import PublicKey, read_public_key
 from api.http.audit import operator
 from api.http.schemas import iso_time
 from api.service.opening import checked_store
@@ -22,7 +22,6 @@ from templates.store.audit_chain import Anchor
 from templates.store.audit_log import Line
 from templates.store.identifiers import InvalidIdentifier
 
-PROBLEMS_SHOWN = 20
 MAX_ANCHOR_BYTES = 4096
 
 app = typer.Typer(no_args_is_help=True)
@@ -61,29 +60,18 @@ def verify(
         progress("verifying the audit log", None) as advance,
     ):
         report = store.verify_audit_log(anchor=kept, progress=advance)
-    problem, records, intact = report.problem, report.records, report.intact
-    facts = {
-        "intact": intact,
-        "lines": report.lines,
-        "head": str(report.head),
-        "problem": problem and {"sequence": problem.sequence, "problem": problem.what},
-        "records": [{"problem": record.what, "about": record.about} for record in records],
-    }
-    if intact:
-        checked = "" if kept is None else f", and holds the head of line {kept.sequence}"
-        text = [
-            f"The audit log is intact: {report.lines} lines{checked}.",
-            "Keys, tenants, enrollments and counts of failed attempts are as it tells.",
-        ]
-        return Result(facts, text)
-    if problem is not None:
-        message(f"line {problem.sequence}: {problem.what}")
-    for record in records[:PROBLEMS_SHOWN]:
-        message(f"{record.about}: {record.what}")
-    if len(records) > PROBLEMS_SHOWN:
-        message(f"… and {len(records) - PROBLEMS_SHOWN} more")
-    what = "the audit log was" if problem is not None else "records of the database were"
-    return Result(facts, error=f"{what} tampered with, or damaged")
+    problem, records = report.problem, report.records
+    what = "records of the database were" if problem is None else "the audit log was"
+    return Result(
+        {
+            "intact": report.intact,
+            "lines": report.lines,
+            "head": str(report.head),
+            "problem": problem and {"sequence": problem.sequence, "problem": problem.what},
+            "records": [{"problem": record.what, "about": record.about} for record in records],
+        },
+        error=None if report.intact else f"{what} tampered with, or damaged",
+    )
 
 
 @app.command()
@@ -105,8 +93,7 @@ def archive(
     Example: `veilface audit-log archive audit-2026.jsonl`
     """
     with checked_store(settings) as store:
-        moved = store.archive_audit_log(file, through=through, by=operator())
-    return _archived(moved, f"Moved {moved.lines} lines into {file}.")
+        return _archived(store.archive_audit_log(file, through=through, by=operator()))
 
 
 @app.command("verify-archive")
@@ -118,19 +105,16 @@ def verify_archive_file(
 ) -> Result:
     """Check an archive's signature and lines; exit status 1 if they are not good.
 
-    Needs no service and no other key.
+    Needs no service and no other key. Shows which line the archive follows on, and its last.
 
     Example: `veilface audit-log verify-archive audit-2026.jsonl --public-key contract.json`
     """
-    checked = verify_archive(file, read_public_key(public_key))
-    return _archived(checked, f"{file} is intact: {checked.lines} lines.")
+    return _archived(verify_archive(file, read_public_key(public_key)))
 
 
-def _archived(archived: Archive, sentence: str) -> Result:
-    return Result(
-        {"lines": archived.lines, "base": str(archived.base), "last": str(archived.last)},
-        [sentence, f"Its lines follow on {archived.base} and end with {archived.last}."],
-    )
+def _archived(archived: Archive) -> Result:
+    ends = {"base": str(archived.base), "last": str(archived.last)}
+    return Result({"lines": archived.lines, **ends})
 
 
 @app.command()
@@ -149,7 +133,7 @@ def head(*, settings: Settings) -> Result:
 
 
 @app.command()
-@takes_settings(*STORE)
+@reports(*STORE)
 def show(
     *,
     settings: Settings,
@@ -175,26 +159,18 @@ def show(
             for line in store.audit_log.lines(after=after)
             if name in (None, line.tenant) and pseudonym in (None, line.pseudonym)
         )
-        first = next(chosen, None)
-        if first is None and name is not None:
+        is_empty = True
+        for line in islice(chosen, limit):
+            say(json.dumps(_described(line)))
+            is_empty = False
+        if is_empty and name is not None:
             store.tenants.get(name)  # one that does not exist has no empty log
-        elif first is not None:
-            told = islice(chain([first], chosen), limit)
-            say_lines(json.dumps(_described(line)) for line in told)
 
 
 def _described(line: Line) -> dict[str, Any]:
-    return {
-        "sequence": line.sequence,
-        "at": iso_time(line.at),
-        "tenant": line.tenant,
-        "actor": line.actor,
-        "action": line.action,
-        "subject": line.pseudonym,
-        "outcome": line.outcome,
-        "detail": line.detail,
-        "request_id": line.request_id,
-    }
+    names = ("sequence", "tenant", "actor", "action", "outcome", "detail", "request_id")
+    facts = {name: getattr(line, name) for name in names}
+    return {**facts, "at": iso_time(line.at), "subject": line.pseudonym}
 
 
 def _read_anchor(text: str) -> Anchor:

@@ -16,10 +16,10 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
+from api.cli.bulk import listed_numbers
 from api.cli.console import progress
-from api.cli.inputs import listed_dims, listed_numbers
-from api.cli.options import PROCESSOR, Device, chosen_device
-from api.cli.results import Result, Table, reports
+from api.cli.options import PROCESSOR, Device, reports, torch_device
+from api.cli.results import Result
 from api.settings import processors
 from templates.distances import Metric, Probes, on_device, pairwise_distances, warm_up
 from templates.keys.randomness import Keystream
@@ -32,7 +32,6 @@ LONG_MS = 200
 """Milliseconds beside which it does not count that threads have to wake up."""
 AUTHORS_COUNT = 100
 """Probes, and templates, of the authors' formula."""
-COLUMNS = ("n", "m", "mode", "metric", "product, ms", "distances, ms", "× product", "authors")
 
 
 @reports()
@@ -52,57 +51,32 @@ def distances(
 
     Needs the extra `evaluate`. It draws embeddings of nobody, spread like faces, and lifts them.
     Points are compared with templates (`p2s`), and lifted probes (`s2s`); Euclidean distances are
-    the paper's, spherical ones the service's. `× product` is a time as a multiple of the matrix
-    product that a distance starts from, in the same run; `authors` is the paper's Euclidean formula
-    as its authors compute it, in multiples of our time. The default options take some minutes.
+    the paper's, spherical ones the service's. `to product` is a time as a multiple of the matrix
+    product that a distance starts from, in the same repeat, with the smallest and the largest;
+    `authors` is the paper's Euclidean formula as its authors compute it, in multiples of our time.
+    Times are medians in ms. The default options take some minutes.
 
     Example: `veilface bench distances --n 512 --dim 16`
     """
     sizes = listed_numbers(n, "--n", least=2)
-    dims = listed_dims(dim, "--dim", n=min(sizes), example="8,16")
-    cells = [
-        (size, m, kind, name)
-        for size, m in product(sizes, dims)
-        for kind in ("p2s", "s2s")
-        for name in Metric
-    ]
-    on = chosen_device(device)
+    dims = listed_numbers(dim, "--dim", most=min(sizes) - 1)
+    cells = list(product(sizes, dims, ("p2s", "s2s"), Metric))
+    on = torch_device(device)
     if on is None:
         warm_up()
     rows = []
-    with (
-        progress("measuring", len(cells)) as advance,
-        on_device(on),
-    ):
-        for size, m, kind, each in cells:
+    with progress("measuring", len(cells)) as advance, on_device(on):
+        for size, m, mode, metric in cells:
             stream = Keystream.seeded("distance bench", size, m)
             templates = face_like_templates(count, m, size, stream=stream)
             probes: Probes = face_like(count, size, stream=stream)
-            if kind == "s2s":
+            if mode == "s2s":
                 probes = face_like_templates(count, m, size, stream=stream)
-            times = time_in_turn(probes, templates, each, repeats=repeats)
-            rows.append({"n": size, "m": m, "mode": kind, "metric": str(each), **times})
+            times = time_in_turn(probes, templates, metric, repeats=repeats)
+            rows.append({"n": size, "m": m, "mode": mode, "metric": metric, **times})
             advance(1)
-    shown = [
-        (
-            *(row[name] for name in ("n", "m", "mode", "metric")),
-            f"{row['product_ms']:.1f}",
-            f"{row['distances_ms']:.1f}",
-            f"{row['ratio_to_product']:.2f} ({row['ratio_to_product_low']:.2f}-"
-            f"{row['ratio_to_product_high']:.2f})",
-            f"{row['authors_to_distances']:.1f} ×",
-        )
-        for row in rows
-    ]
     machine = {"processors": processors(), "device": device}
-    return Result(
-        {"machine": machine, "count": count, "repeats": repeats, "rows": rows},
-        [
-            Table(f"{count} × {count} distances in float32", COLUMNS, shown),
-            f"Of {repeats} repeats: median times, and medians of their ratios (smallest to largest "
-            f"in brackets); {processors()} processors. CONTRIBUTING.md says how to read it.",
-        ],
-    )
+    return Result({"machine": machine, "count": count, "repeats": repeats, "rows": rows})
 
 
 def time_in_turn(
@@ -125,13 +99,12 @@ def time_in_turn(
         row[2] = _milliseconds(lambda: authors_distances(probes[some], templates[some])) * share
     whole, ours, authors = times[1:].T  # the first round only fetches code and memory
     return {
-        "product_ms": statistics.median(whole),
-        "distances_ms": statistics.median(ours),
-        "authors_ms": statistics.median(authors),
-        "ratio_to_product": statistics.median(ours / whole),
-        "ratio_to_product_low": float((ours / whole).min()),
-        "ratio_to_product_high": float((ours / whole).max()),
-        "authors_to_distances": statistics.median(authors / ours),
+        "product": statistics.median(whole),
+        "distances": statistics.median(ours),
+        "to_product": statistics.median(ours / whole),
+        "low": float((ours / whole).min()),
+        "high": float((ours / whole).max()),
+        "authors": statistics.median(authors / ours),
     }
 
 

@@ -18,17 +18,17 @@ from typing import Annotated
 import numpy as np
 import typer
 
+from api.cli.bulk import listed_numbers
 from api.cli.console import demo_notice, progress
 from api.cli.errors import CommandError, UsageError
-from api.cli.files import read_photo
-from api.cli.inputs import listed_numbers
-from api.cli.results import Result, Table, reports
+from api.cli.files import read_photos
+from api.cli.options import reports
+from api.cli.results import Result
 from api.settings import MAX_ONNX_THREADS, Settings, processors
 from models.errors import ModelError
 from models.pack import ModelPack
 from models.synthetic import draw_face, encode_photo
 
-DEFAULT_THREADS: int = Settings.model_fields["onnx_threads"].default
 PHOTOS_EACH = 4
 """Photos that each caller sends in one repeat."""
 DRAWN, PEOPLE = 4, 40
@@ -62,10 +62,7 @@ def models(
             help="A photo with a face; repeat for more. Unset: some are drawn.", show_default=False
         ),
     ] = None,
-    threads: Annotated[
-        str,
-        typer.Option(help="Values of `onnx_threads` to try beside its default."),
-    ] = "1,2,4",
+    threads: Annotated[str, typer.Option(help="Values of `onnx_threads` to try.")] = "1,2,4",
     repeats: Annotated[
         int, typer.Option(min=1, help="Timed repeats; medians of them are shown.")
     ] = 9,
@@ -80,42 +77,29 @@ def models(
     if settings.pack is None:
         raise UsageError("a pack is what is timed; name it with --pack")
     here = processors()
-    tried = listed_numbers(threads, "--threads", least=1, most=MAX_ONNX_THREADS)
-    own = {str(path): read_photo(path) for path in photo or ()}
     packs = {
         count: ModelPack.load(settings.pack, providers=settings.providers, threads=count)
-        for count in sorted({DEFAULT_THREADS, *tried})
+        for count in listed_numbers(threads, "--threads", most=MAX_ONNX_THREADS)
     }
-    info = packs[DEFAULT_THREADS].info
-    rows = time_photos(packs, own, repeats=repeats, here=here)
-    columns = tuple(Row.__dataclass_fields__)
-    cells = [
-        [f"{value:.2f}" if isinstance(value, float) else value for value in vars(row).values()]
-        for row in rows
-    ]
+    one = next(iter(packs.values()))
+    rows = time_photos(packs, _usable(one, photo or []), repeats=repeats, here=here)
     return Result(
         {
-            "pack": info.name,
+            "pack": one.info.name,
             "processors": here,
             "providers": settings.providers,
             "repeats": repeats,
             "photos": rows,
-            "advice": advice(rows, here=here),
-            **demo_notice(info.embedder_sha256, n=info.n),
-        },
-        [
-            Table(f"Whole photos, {info.name}", columns, cells),
-            f"Medians of {repeats} repeats on {here} processors.",
-            advice(rows, here=here),
-        ],
+            "advice": advice(rows),
+            **demo_notice(one.info),
+        }
     )
 
 
 def time_photos(
-    packs: Mapping[int, ModelPack], own: Mapping[str, bytes], *, repeats: int, here: int
+    packs: Mapping[int, ModelPack], photos: Sequence[bytes], *, repeats: int, here: int
 ) -> list[Row]:
-    """Time photos, one's own by their names or drawn ones, with packs by their threads."""
-    photos = _usable(packs[DEFAULT_THREADS], own)
+    """Time photos with packs by their threads."""
     keys = [
         (callers, threads, slots)
         for callers, threads in product(sorted({1, here, 2 * here}), packs)
@@ -133,19 +117,15 @@ def time_photos(
     return [Row(*key, *median) for key, median in zip(keys, medians, strict=True)]
 
 
-def advice(rows: Sequence[Row], *, here: int) -> str:
+def advice(rows: Sequence[Row]) -> str:
     """Say which settings answer most photos a second at full load, and one photo soonest."""
     full = [row for row in rows if row.callers == max(row.callers for row in rows)]
-    single = [row for row in rows if row.callers == 1]
     most = max(full, key=lambda row: row.photos_per_s)
-    soonest = min(single, key=lambda row: row.p50_ms)
-    usual = next(r for r in full if (r.onnx_threads, r.compute_slots) == (DEFAULT_THREADS, here))
-    alone = next(row for row in single if row.onnx_threads == DEFAULT_THREADS)
+    soonest = min((row for row in rows if row.callers == 1), key=lambda row: row.p50_ms)
     return (
         f"onnx_threads = {most.onnx_threads} and compute_slots = {most.compute_slots} answer most "
-        f"photos a second here ({most.photos_per_s:.1f}; {usual.photos_per_s:.1f} with the "
-        f"defaults); onnx_threads = {soonest.onnx_threads} answers a single photo soonest "
-        f"({soonest.p50_ms:.1f} ms; {alone.p50_ms:.1f} ms with the default)."
+        f"photos a second here ({most.photos_per_s:.1f}); onnx_threads = {soonest.onnx_threads} "
+        f"answers a single photo soonest ({soonest.p50_ms:.1f} ms)."
     )
 
 
@@ -168,18 +148,18 @@ def _load(
     return len(calls) / spent[0], statistics.median(times), spent[1] / len(calls)
 
 
-def _usable(pack: ModelPack, own: Mapping[str, bytes]) -> list[bytes]:
+def _usable(pack: ModelPack, own: Sequence[Path]) -> list[bytes]:
     """Photos that the pack can embed: one's own, or drawn ones of people who do not exist."""
-    for name, photo in own.items():
+    photos = read_photos(own, most=100)
+    for path, photo in zip(own, photos, strict=True):
         try:
             _embed(pack, photo)
         except ModelError as error:
-            raise CommandError(f"{name}: {error}") from error
-    if own:
-        return list(own.values())
+            raise CommandError(f"{path}: {error}") from None
+    if photos:
+        return photos
     if pack.info.detector is None:
         return [encode_photo(draw_face(who, size=pack.crop_size)) for who in range(DRAWN)]
-    photos: list[bytes] = []
     for who in range(PEOPLE):
         picture = np.pad(draw_face(who, size=224), ((128, 128), (208, 208), (0, 0)), "edge")
         if pack.detect(picture):

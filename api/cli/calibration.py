@@ -10,12 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from attacks.operating_point import (
-    OperatingPoint,
-    choose_and_judge,
-    judge_accuracy,
-    judge_groups,
-)
+from attacks.operating_point import OperatingPoint, choose_and_judge, judge_accuracy, judge_groups
 from attacks.setup import AttackSetup
 from models.extraction import Extraction
 from models.pack import ModelPack
@@ -47,6 +42,7 @@ class CalibratedFolder:
     """A contract with its verdict, the report of its calibration, and why it has its dimension."""
 
     contract: Contract
+    verdict: Verdict
     report: CalibrationReport
     point: OperatingPoint
 
@@ -76,8 +72,7 @@ def calibrate_folder(
         )
     name_of = dict(zip(folder.paths, folder.identities, strict=True))
     names = [name_of[path] for path in extraction.paths]
-    if names:
-        require_others(source, extraction.embeddings, names)
+    require_others(source, extraction.embeddings, names)
     # Thousands of products of small matrices: with a second thread for each, the library spends
     # most of its time waiting. The distances have threads of their own.
     with single_threaded():
@@ -110,7 +105,7 @@ def calibrate_folder(
             done.contract, photos=extraction.attempts, not_acquired=len(extraction.failures)
         )
     verdict = Verdict(point.privacy, accuracy, judge_groups(done.contract))
-    return CalibratedFolder(replace(done.contract, verdict=verdict), done.report, point)
+    return CalibratedFolder(replace(done.contract, verdict=verdict), verdict, done.report, point)
 
 
 def operating_point(

@@ -5,41 +5,29 @@ its exit status is an answer too. Rich is imported where something is drawn: mos
 speak, without it.
 """
 
+import contextlib
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Protocol
 
 import typer
 
-Advance = Callable[[int], None]
+Advance = Callable[[float], None]
 
 
 def message(text: str) -> None:
     """Say something to the person; it does not disturb a program that reads stdout."""
-    _write(text, err=True)
+    with contextlib.suppress(OSError):
+        typer.echo(text, err=True)
 
 
 def say(text: str) -> None:
     """Write one line of the result to stdout."""
-    _write(text)
-
-
-def say_lines(lines: Iterable[str]) -> None:
-    """Write lines to stdout, until there are no more or the reader has gone."""
     try:
-        for line in lines:
-            typer.echo(line)
+        typer.echo(text)
     except BrokenPipeError:
-        drop_unwritten()
-
-
-def _write(text: str, *, err: bool = False) -> None:
-    try:
-        typer.echo(text, err=err)
-    except OSError as error:
-        if not (err or isinstance(error, BrokenPipeError)):
-            raise
         drop_unwritten()
 
 
@@ -57,39 +45,58 @@ def counted(number: int, noun: str) -> str:
     return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
-def demo_notice(embedder_sha256: str, *, n: int) -> dict[str, str]:
-    """Say so on stderr where the embedder is the demo model; the same as a part of JSON.
+class Embedded(Protocol):
+    """A pack or a binding, as far as it says what gave the embeddings."""
 
-    ``n`` is its dimension: a model of another one is not compared, which takes a second.
-    """
+    @property
+    def embedder_sha256(self) -> str:
+        """SHA-256 of the embedder's file."""
+        ...
+
+    @property
+    def n(self) -> int:
+        """Numbers in an embedding."""
+        ...
+
+
+def demo_notice(made_by: Embedded) -> dict[str, str]:
+    """Say so on stderr where the embedder is the demo model; the same as a part of JSON."""
     # Imported here, since commands that touch no model shall not wait for its libraries.
     from models.demo import DEMO_DIMENSION, DEMO_NOTICE, is_demo_model
 
-    if n != DEMO_DIMENSION or not is_demo_model(embedder_sha256):
+    # A model of another dimension is not compared, which takes a second.
+    if made_by.n != DEMO_DIMENSION or not is_demo_model(made_by.embedder_sha256):
         return {}
     message(f"note: {DEMO_NOTICE}")
     return {"notice": DEMO_NOTICE}
 
 
-def progress(description: str, total: int | None) -> AbstractContextManager[Advance]:
-    """Show on stderr how many of ``total`` things, such as photos, are done.
+@contextmanager
+def progress(description: str, total: float | None) -> Iterator[Advance]:
+    """Show on stderr how much of ``total`` is done; the result is called with what is done since.
 
-    The result is called with the number of things that were done since. For work that has no such
-    unit there is :func:`share_done`.
+    Of an unknown total, as None, only the amount is shown.
     """
-    return _bar(description, total, "MofNCompleteColumn")
+    from rich import console, progress
 
-
-def download(description: str, total: int | None) -> AbstractContextManager[Advance]:
-    """Show on stderr how many of ``total`` bytes have come; the result is called with more."""
-    return _bar(description, total, "DownloadColumn")
+    terminal = console.Console(stderr=True)
+    with progress.Progress(
+        progress.TextColumn("{task.description}"),
+        progress.BarColumn(),
+        progress.TaskProgressColumn(show_speed=True),
+        progress.TimeRemainingColumn(),
+        console=terminal,
+        transient=not terminal.is_terminal,
+    ) as bar:
+        task = bar.add_task(description, total=total)
+        yield lambda done: bar.advance(task, done)
 
 
 @contextmanager
 def share_done(description: str) -> Iterator[Callable[[float], None]]:
     """Show per cent on stderr while the block runs; call the result with the share from 0 to 1."""
     before = 0.0
-    with _bar(description, 1.0, "TaskProgressColumn") as advance:
+    with progress(description, 1.0) as advance:
 
         def report(share: float) -> None:
             nonlocal before
@@ -97,20 +104,3 @@ def share_done(description: str) -> Iterator[Callable[[float], None]]:
             before = share
 
         yield report
-
-
-@contextmanager
-def _bar(description: str, total: float | None, amount: str) -> Iterator[Callable[[float], None]]:
-    from rich import console, progress
-
-    terminal = console.Console(stderr=True)
-    with progress.Progress(
-        progress.TextColumn("{task.description}"),
-        progress.BarColumn(),
-        getattr(progress, amount)(),
-        progress.TimeRemainingColumn(),
-        console=terminal,
-        transient=not terminal.is_terminal,
-    ) as bar:
-        task = bar.add_task(description, total=total)
-        yield lambda done: bar.advance(task, done)

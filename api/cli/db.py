@@ -6,15 +6,14 @@ from typing import Annotated
 import typer
 
 from api.cli.errors import UsageError
-from api.cli.options import STORE, Tenant
-from api.cli.results import Result, as_json, reports
+from api.cli.options import STORE, Tenant, reports
+from api.cli.results import Result, as_json
 from api.http.audit import operator
 from api.http.receipts import receipt_json
 from api.service.opening import checked_store, open_keyring, open_store, retention_of
 from api.settings import DEFAULT_TENANT, Settings
 from templates.errors import VeilfaceError
 from templates.keys.private_file import replace_private
-from templates.store.database import Database
 from templates.store.migrate import current_revision, head_revision
 
 app = typer.Typer(no_args_is_help=True)
@@ -37,17 +36,11 @@ def upgrade(*, settings: Settings) -> Result:
     """
     store = open_store(settings, open_keyring(settings))
     try:
-        before = _revision(settings)
+        before = current_revision(store.database)
         store.upgrade()
-        after = _revision(settings)
+        return Result({"before": before, "after": current_revision(store.database)})
     finally:
         store.close()
-    return Result(
-        {"before": before, "after": after},
-        f"The schema is up to date: {after}."
-        if before == after
-        else f"Migrated from {before or 'an empty database'} to {after}.",
-    )
 
 
 @app.command()
@@ -55,23 +48,21 @@ def upgrade(*, settings: Settings) -> Result:
 def check(*, settings: Settings) -> Result:
     """Check that the schema and the master key match; exit status 1 if they do not.
 
-    `--json` has the schema that the database is at, and the one that this version needs.
+    `current` is the schema that the database is at, and `needed` the one of this version.
 
     Example: `veilface db check --data-dir veilface-data`
     """
     store = open_store(settings, open_keyring(settings))
-    facts = {"current": None, "needed": head_revision()}
+    current, reason = None, None
     try:
-        facts["current"] = _revision(settings)
+        current = current_revision(store.database)
         store.check()
     except VeilfaceError as error:
-        return Result({"ok": False, "reason": str(error), **facts}, error=str(error))
+        reason = str(error)
     finally:
         store.close()
-    return Result(
-        {"ok": True, "reason": None, **facts},
-        "The database has the right schema, and this is its master key.",
-    )
+    facts = {"ok": reason is None, "reason": reason, "current": current, "needed": head_revision()}
+    return Result(facts, error=reason)
 
 
 @app.command()
@@ -87,7 +78,7 @@ def compact(*, settings: Settings) -> Result:
     """
     with checked_store(settings) as store:
         store.database.compact()
-    return Result({"compacted": True}, "Compacted the database.")
+    return Result({"compacted": True})
 
 
 @app.command()
@@ -106,10 +97,8 @@ def unlock(
     """
     with checked_store(settings) as store:
         lifted = store.attempts.reset(tenant, subject, by=operator())
-    facts = {"subject_id": subject, "tenant": tenant, "lifted": lifted}
-    if not lifted:
-        return Result(facts, error="this subject has no failed attempts")
-    return Result(facts, f"Cleared the failed attempts of {subject}.")
+    error = None if lifted else "this subject has no failed attempts"
+    return Result({"subject_id": subject, "tenant": tenant, "lifted": lifted}, error=error)
 
 
 @app.command()
@@ -124,7 +113,8 @@ def purge(
     """Erase subjects whose retention period has ended, and remove expired records.
 
     The service does this every ten minutes. Each erased subject leaves a receipt
-    and a line in the audit log.
+    and a line in the audit log. Where `log_purged` is no, a reader keeps old pages in SQLite's
+    write-ahead log: purge again when it has ended.
 
     Example: `veilface db purge --retention-days 730 --retention-disuse-days 365 --dry-run`
     """
@@ -134,14 +124,7 @@ def purge(
         if not dry_run:
             erased = store.retention.erase_expired(retention)
             log_purged = store.purge()
-    text = [f"Erased {erased} subjects and all expired records."]
-    if dry_run:
-        text = [f"{due} subjects are due to be erased."]
-    elif not log_purged:
-        text.append(
-            "A reader keeps old pages in SQLite's write-ahead log: purge again when it ended."
-        )
-    return Result({"due": due, "erased": erased, "log_purged": log_purged}, text)
+    return Result({"due": due, "erased": erased, "log_purged": log_purged})
 
 
 @app.command("template-enrollment")
@@ -170,10 +153,7 @@ def template_enrollment(
         if allow is not None:
             store.tenants.set_template_enrollment(tenant, allow, by=operator())
         allowed = store.tenants.get(tenant).template_enrollment
-    return Result(
-        {"tenant": tenant, "template_enrollment": allowed},
-        f"Tenant {tenant} {'takes' if allowed else 'does not take'} templates that clients made.",
-    )
+    return Result({"tenant": tenant, "template_enrollment": allowed})
 
 
 @app.command("erase-tenant")
@@ -205,19 +185,6 @@ def erase_tenant(
     with checked_store(settings) as store:
         receipt = store.erasures.erase_tenant(tenant, by=operator()).receipt
     answer = receipt_json(receipt)
-    if out is None:
-        return Result(answer, as_json(answer))
-    replace_private(out, as_json(answer).encode())
-    counts = {item["item"]: item["count"] for item in receipt.claims["erased"]}
-    return Result(
-        answer, f"Erased tenant {tenant}: {counts.get('subjects', 0)} subjects. Receipt: {out}"
-    )
-
-
-def _revision(settings: Settings) -> str | None:
-    """Schema that the database is at; None for an empty one. Needs no master key."""
-    database = Database(settings.resolved_database_url)
-    try:
-        return current_revision(database)
-    finally:
-        database.close()
+    if out is not None:
+        replace_private(out, as_json(answer).encode())
+    return Result(answer, as_json(answer) if out is None else None)

@@ -1,16 +1,16 @@
 """``veilface demo``: everything once, with nothing configured."""
 
-import dataclasses
 import os
 import shutil
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from api.cli.console import message
-from api.cli.results import Result, Table, reports
+from api.cli.options import reports
+from api.cli.results import Result, Table, shown_facts
 from api.cli.verdict import verdict_lines
 from api.demo.run import Outcome, run_demo
 from models.demo import DEMO_NOTICE
@@ -52,60 +52,24 @@ def demo(
     )
     for fault in outcome.faults[:-1]:
         message(f"error: {fault}")
-    return Result(_facts(outcome), _text(outcome), error=next(iter(outcome.faults[-1:]), None))
+    notice = {"notice": DEMO_NOTICE} if outcome.demo_model else {}
+    error = next(iter(outcome.faults[-1:]), None)
+    return Result({**vars(outcome), **notice}, _text(outcome), error=error)
 
 
 def _text(outcome: Outcome) -> list[str | Table]:
-    notice = f"  ({DEMO_NOTICE})" if outcome.demo_model else ""
-    text: list[str | Table] = [f"\n{DEMO_NOTICE}\n"] if outcome.demo_model else []
-    text += [
-        Table(
-            f"Who was accepted, at level {outcome.default_level}{notice}",
-            ("person", "own photos", "photos of others"),
-            [
-                (
-                    one.name,
-                    f"{one.genuine_accepted} of {one.genuine_trials} accepted",
-                    f"{one.impostor_trials - one.impostors_accepted} of {one.impostor_trials} "
-                    "rejected",
-                )
-                for one in outcome.people
-            ],
-        ),
-        Table(
-            f"Security levels{notice}",
-            ("level", "stated FMR", "genuine accepted", "impostors accepted"),
-            [
-                (
-                    one.name,
-                    f"{100 * one.fmr:g} %",
-                    f"{one.genuine_accepted} of {one.genuine_trials}",
-                    f"{one.impostors_accepted} of {one.impostor_trials}",
-                )
-                for one in outcome.levels
-            ],
-        ),
-        Table(
-            f"What is stored: {outcome.strategy}{notice}",
-            (
-                "person",
-                "template",
-                "‖p‖ = cos(face, foot point)",
-                "in the database",
-                "16 bytes of it (ciphertext)",
-            ),
-            [
-                (
-                    one.name,
-                    f"{one.template_bytes} bytes",
-                    f"{one.foot_norm:.3f}",
-                    f"{one.ciphertext_bytes} bytes, AES-256-GCM",
-                    one.ciphertext_excerpt,
-                )
-                for one in outcome.stored
-            ],
-        ),
-    ]
+    notice = [DEMO_NOTICE] if outcome.demo_model else []
+    suffix = "".join(f"  ({one})" for one in notice)
+    at_default = f"Who was accepted, at level {outcome.default_level}{suffix}"
+    tables = {
+        at_default: outcome.people,
+        f"Security levels{suffix}": outcome.levels,
+        f"What is stored: {outcome.strategy}{suffix}": outcome.stored,
+    }
+    folder = outcome.folder
+    text: list[str | Table] = [f"\n{one}\n" for one in notice]
+    for title, records in tables.items():
+        text += shown_facts(list(records), title)
     text += [f"Not usable, counted as rejected: {refusal}" for refusal in outcome.refused_photos]
     if outcome.receipt:
         text.append(
@@ -113,7 +77,6 @@ def _text(outcome: Outcome) -> list[str | Table]:
             f"receipt for the pseudonym {outcome.receipt['subject'][:16]}…"
         )
     text += verdict_lines(outcome.verdict)
-    folder = outcome.folder
     text.append(
         f"\nDone in {outcome.seconds:.0f} s. Start the service on the same data:\n\n"
         f"  {_program()} serve --config {folder}/veilface.toml\n\n"
@@ -123,7 +86,7 @@ def _text(outcome: Outcome) -> list[str | Table]:
         f'  curl -H "Authorization: Bearer $(cat {folder}/api-key)" '
         "http://127.0.0.1:8421/v1/subjects\n"
     )
-    return [*text, DEMO_NOTICE] if outcome.demo_model else text
+    return [*text, *notice]
 
 
 def _program() -> str:
@@ -132,11 +95,3 @@ def _program() -> str:
     if program.name != "veilface" or shutil.which("veilface") == str(program.absolute()):
         return "veilface"
     return os.path.relpath(program)
-
-
-def _facts(outcome: Outcome) -> dict[str, Any]:
-    notice = {"notice": DEMO_NOTICE} if outcome.demo_model else {}
-    return {
-        **{part.name: getattr(outcome, part.name) for part in dataclasses.fields(outcome)},
-        **notice,
-    }

@@ -1,19 +1,18 @@
 """``veilface evaluate liveness``: what the liveness graphs of a pack detect, and what not."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from api.cli.bulk import BULK, Bulk, Decoys, listed, write_document
 from api.cli.console import demo_notice, message, progress
-from api.cli.descriptors import BULK, bulk_pack
 from api.cli.errors import CommandError, UsageError, require_extra
-from api.cli.evaluation_report import write_results
-from api.cli.inputs import listed, load_decoys
-from api.cli.results import Plan, Result, Table, reports
-from api.service.opening import file_sealer, open_keyring
+from api.cli.options import Plan, reports
+from api.cli.results import Result, Table
 from api.settings import Settings
-from attacks.impostor_presentations import verify_presentations
+from attacks.impostor_presentations import ENROLLED_PHOTOS, verify_presentations
 from models.liveness import PassiveLiveness
 from models.pack import ModelPack
 from templates.contract.document import Contract
@@ -27,8 +26,8 @@ from verify.evaluation.liveness.document import (
 from verify.evaluation.liveness.presentations import PresentationSet, read_presentations
 from verify.evaluation.liveness.rates import threshold_at_bpcer
 from verify.evaluation.liveness.scores import ScoredSet, VerifiedSet, score_set
-from verify.evaluation.plan import Json
 from verify.evaluation.provenance import model_facts
+from verify.evaluation.tables import write_csv
 from verify.preparation import recorded_of
 
 
@@ -50,20 +49,10 @@ def evaluate_liveness(
             "attacks go through the whole verification."
         ),
     ] = None,
-    decoys: Annotated[
-        Path | None,
-        typer.Option(
-            help="The contract's decoys. Unset: `decoys.veil` in `data_dir`, where it is."
-        ),
-    ] = None,
+    decoys: Decoys = None,
     bpcer: Annotated[
-        str,
-        typer.Option(help="Also set thresholds on these photos, at these BPCER."),
+        str, typer.Option(help="Also set thresholds on these photos, at these BPCER.")
     ] = "0.01,0.05,0.1",
-    level: Annotated[
-        str | None,
-        typer.Option(help="Level of the whole verification. Unset: the contract's default."),
-    ] = None,
     out: Annotated[Path, typer.Option(help="Folder of the results.")] = Path("liveness"),
     _plan: Plan = None,
 ) -> Result:
@@ -80,43 +69,40 @@ def evaluate_liveness(
     targets = listed(bpcer, float, "--bpcer", expected="rates such as 0.01,0.05")
     if not all(0 < target < 1 for target in targets):
         raise UsageError("--bpcer takes rates between 0 and 1")
-    if contract is None and (decoys is not None or level is not None):
-        raise UsageError("--decoys and --level are of the whole verification: give --contract too")
     presented = read_presentations(data, attacks=True)
-    pack = bulk_pack(settings, flip=False, why="liveness graphs are part of a model pack")
+    bulk = Bulk(settings)
+    bound = None if contract is None else Contract.load(contract, bulk.sealer)
+    if bound is not None:
+        bulk = Bulk(settings, flip=bool(bound.binding.preprocessing["flip"]))
+    pack = bulk.pack
     liveness = require_liveness(pack)
-    bound = None
-    if contract is not None:
-        bound = Contract.load(contract, file_sealer(open_keyring(settings)))
-        if bound.binding.preprocessing["flip"]:
-            pack = bulk_pack(settings, flip=True, why="")
     if bound is not None and bound.liveness is not None:
         bound.liveness.require_graphs(liveness.graphs)
     scored = score_with_progress(pack, presented)
-    require_responses(scored)
     points, refused = _points(scored, bound, targets)
-    verified, unverified = _verified(scored, pack, bound, settings, decoys=decoys, level=level)
+    verified = _verified(scored, bulk, bound, decoys)
     results = document(
         scored,
         model_facts(pack.info, recorded_of(pack)),
         liveness,
         points,
         contract=bound,
-        verified=verified,
-        unverified=unverified,
+        verified=None if isinstance(verified, str) else verified,
+        unverified=verified if isinstance(verified, str) else None,
         refused=refused,
     )
-    out.mkdir(parents=True, exist_ok=True)
-    written = write_results(results, markdown(results), {}, out)
-    notice = demo_notice(pack.info.embedder_sha256, n=pack.info.n)
-    facts = results["verification"]
+    written = write_document(results, out, "results", markdown=markdown(results))
+    files = [*(path.name for path in written), "results.csv"]
+    write_csv(results["rows"], out / "results.csv")
+    live, attacks = results["dataset"]["live"], sum(results["dataset"]["attacks"].values())
+    title = f"{presented.name}: {live} live photos, {attacks} attacks"
     return Result(
-        {**notice, "out": out, "files": [path.name for path in written], **results},
+        {**demo_notice(pack.info), "out": out, "files": files, **results},
         [
-            _summary(results),
-            *([] if facts["measured"] else [f"IAPMR was not measured: {facts['reason']}."]),
+            Table(title, *row_cells(results["rows"])),
+            *([f"IAPMR was not measured: {verified}."] if isinstance(verified, str) else []),
             *(f"Not reported: {sentence}." for sentence in refused),
-            f"{out}: {', '.join(path.name for path in written)}.",
+            f"{out}: {', '.join(files)}.",
         ],
     )
 
@@ -140,19 +126,16 @@ def score_with_progress(pack: ModelPack, presented: PresentationSet) -> ScoredSe
     return scored
 
 
-def require_responses(scored: ScoredSet) -> None:
-    """Refuse a set of which a whole side has no face."""
-    attacks = [len(scored.scored(name)) for name in scored.presented.species]
-    if not len(scored.scored(None)) or not any(attacks):
+def _points(
+    scored: ScoredSet, contract: Contract | None, targets: Sequence[float]
+) -> tuple[dict[str, float], list[str]]:
+    """Thresholds to report at, and why there are none at others."""
+    live = scored.scored(None)
+    if not len(live) or not any(len(scored.scored(name)) for name in scored.presented.species):
         raise CommandError(
             "a face was found in no live photo, or in no attack photo: are these whole frames with "
             "a face in them?"
         )
-
-
-def _points(
-    scored: ScoredSet, contract: Contract | None, targets: tuple[float, ...]
-) -> tuple[dict[str, float], list[str]]:
     points: dict[str, float] = {}
     refused = []
     if contract is not None and contract.liveness is not None:
@@ -161,9 +144,9 @@ def _points(
         refused.append(
             "the contract has no liveness threshold; `veilface calibrate --liveness` sets one"
         )
-    for target in sorted(set(targets)):
+    for target in sorted(targets):
         try:
-            points[f"bpcer-{target:g}"] = threshold_at_bpcer(scored.scored(None), target)
+            points[f"bpcer-{target:g}"] = threshold_at_bpcer(live, target)
         except DatasetError as error:
             refused.append(str(error))
     if not points:
@@ -172,33 +155,15 @@ def _points(
 
 
 def _verified(
-    scored: ScoredSet,
-    pack: ModelPack,
-    contract: Contract | None,
-    settings: Settings,
-    *,
-    decoys: Path | None,
-    level: str | None,
-) -> tuple[VerifiedSet | None, str | None]:
+    scored: ScoredSet, bulk: Bulk, contract: Contract | None, decoys: Path | None
+) -> VerifiedSet | str:
     """Verify the photos, or say why that was not done."""
-    if contract is None:
-        return None, "it takes a contract (--contract) and its decoys"
+    if contract is None or not (decoys or bulk.settings.resolved_decoys_file).is_file():
+        return "it takes a contract (--contract) and its decoys (--decoys)"
     if not any(one.subject for one in scored.presentations):
-        return None, "nothing says whose faces the photos show; give a CSV with subjects"
-    file = decoys or settings.resolved_decoys_file
-    if decoys is None and not file.is_file():
-        return None, "it takes the contract's decoys (--decoys)"
-    source = load_decoys(file, file_sealer(open_keyring(settings)), pack)
-    source = source.reduced(contract.binding.axes)
-    verified = verify_presentations(scored, pack.info, contract, source, level=level)
+        return "nothing says whose faces the photos show; give a CSV with subjects"
+    source = bulk.decoys(decoys).reduced(contract.binding.axes)
+    verified = verify_presentations(scored, bulk.pack.info, contract, source)
     if not verified.enrolled:
-        return None, (
-            f"no subject has {verified.enrolled_photos} live photos that agree, to be enrolled by"
-        )
-    return verified, None
-
-
-def _summary(results: Json) -> Table:
-    live, attacks = results["dataset"]["live"], sum(results["dataset"]["attacks"].values())
-    title = f"{results['dataset']['name']}: {live} live photos, {attacks} attacks"
-    return Table(title, *row_cells(results["rows"]))
+        return f"no subject has {ENROLLED_PHOTOS} live photos that agree, to be enrolled by"
+    return verified

@@ -1,18 +1,16 @@
-"""What ``veilface evaluate`` works on: sets, the embedder, decoys, and the cache."""
+"""What ``veilface evaluate`` works on: sets, the embedder and decoys."""
 
 import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 
-from api.cli.descriptors import bulk_pack
+from api.cli.bulk import Bulk
 from api.cli.errors import CommandError, UsageError
-from api.service.opening import file_sealer, open_keyring
-from api.settings import Settings
-from models.sessions import default_workers
 from templates.decoys import DecoyGenerator, DecoyPool, load_source
 from templates.decoys.pool import POOL_MAGIC
 from verify.evaluation.embedding import Embedder, FileEmbedder, PackEmbedder
 from verify.evaluation.embeddings_file import read_embeddings
+from verify.evaluation.plan import Source
 from verify.evaluation.readers import open_sets
 from verify.evaluation.sources import SourceFacts
 from verify.evaluation.verification_set import VerificationSet
@@ -33,34 +31,20 @@ def open_all(datasets: Sequence[Path], *, pictures: bool) -> list[VerificationSe
     return sets
 
 
-def open_embedder(
-    settings: Settings,
-    embeddings: Path | None,
-    *,
-    flip: bool,
-    aligned: bool | None,
-) -> Embedder:
-    """Open the pack or the file of embeddings."""
-    no_pack = settings.pack is None or str(settings.pack) == NO_PACK
+def open_embedder(bulk: Bulk, embeddings: Path | None, *, aligned: bool | None) -> Embedder:
+    """Open the pack, or the file of embeddings."""
+    has_pack = bulk.settings.pack is not None and str(bulk.settings.pack) != NO_PACK
+    if has_pack == (embeddings is not None):
+        raise UsageError("give a pack, or `--pack none --embeddings FILE`: the one or the other")
     if embeddings is None:
-        why = "embeddings come from a model pack; without one, give --pack none --embeddings FILE"
-        if no_pack:
-            raise UsageError(why)
-        pack = bulk_pack(settings, flip=flip, why=why)
-        return PackEmbedder(
-            pack,
-            recorded_of(pack),
-            aligned=aligned,
-        )
-    if not no_pack:
-        raise UsageError("give a pack, or --pack none and --embeddings, not both")
-    if flip:
+        return PackEmbedder(bulk.pack, recorded_of(bulk.pack), aligned=aligned)
+    if bulk.flip:
         raise UsageError("--flip needs a pack: embeddings in a file are as they are")
     return FileEmbedder(read_embeddings(embeddings), embeddings.name)
 
 
 def open_sources(
-    files: Sequence[Path], settings: Settings, embedder: Embedder, *, axes: int | None = None
+    files: Sequence[Path], bulk: Bulk, embedder: Embedder, *, axes: int | None
 ) -> list[SourceFacts]:
     """Load decoy files, reduce generators to so many axes, and check that they fit."""
     sources = []
@@ -70,27 +54,18 @@ def open_sources(
             stream.seek(0)
             digest = hashlib.file_digest(stream, "sha256").hexdigest()
         # A generator is not sealed, and needs no key.
-        source: DecoyPool | DecoyGenerator = (
-            load_source(file, file_sealer(open_keyring(settings)))
-            if is_pool
-            else DecoyGenerator.load(file)
-        )
+        source: Source = load_source(file, bulk.sealer) if is_pool else DecoyGenerator.load(file)
         if axes is not None and not is_pool:
             source = source.reduced(axes)
-        if source.n != embedder.model["n"]:
-            raise CommandError(
-                f"{file.name} has decoys of {source.n} numbers each, the embeddings have "
-                f"{embedder.model['n']}; build the decoys with this pack"
-            )
         if isinstance(embedder, PackEmbedder):
             require_made_with(source, embedder.pack)
+        elif source.n != embedder.model["n"]:
+            raise CommandError(
+                f"{file.name} has decoys of {source.n} numbers each, the embeddings have "
+                f"{embedder.model['n']}; build the decoys with their pack"
+            )
         sources.append(SourceFacts(source, file.name, digest))
     kinds = [isinstance(facts.source, DecoyPool) for facts in sources]
     if len(set(kinds)) != len(kinds):
         raise UsageError("give one pool and one generator at most: rows name the kind only")
     return sources
-
-
-def default_jobs() -> int:
-    """Threads: as many as processors, 8 at most, since each needs about 0.2 GB."""
-    return min(8, default_workers())

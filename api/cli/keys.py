@@ -1,6 +1,5 @@
-"""``veilface keys``: API keys, the master key, and receipts of erasure."""
+"""``veilface keys``: API keys, the rotation of a tenant, and receipts of erasure."""
 
-from collections.abc import Mapping
 from datetime import timedelta
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,10 +10,9 @@ from api.cli import master_keys
 from api.cli.console import message, progress
 from api.cli.errors import CommandError
 from api.cli.files import read_bounded
-from api.cli.master_keys import opened_store
-from api.cli.options import STORE, Tenant
-from api.cli.public_key import PublicKey, read_public_key
-from api.cli.results import Result, Table, reports
+from api.cli.options import STORE, Tenant, reports
+from api.cli.results import Result
+from api.cli.store import PublicKey, opened_store, read_public_key
 from api.http.audit import operator
 from api.http.receipts import verify_answer
 from api.service.opening import open_contract, open_keyring
@@ -22,18 +20,11 @@ from api.settings import DEFAULT_TENANT, Settings
 from templates.contract.canonical import parse_object
 from templates.errors import StoreError
 from templates.keys.private_file import create_private
-from templates.store.api_keys import ApiKey, NewApiKey, Right
+from templates.store.api_keys import ApiKey, Right
 from templates.store.identifiers import utc_now
 from templates.store.receipts import key_fingerprint
 
 MAX_JSON_BYTES = 2**20
-
-KeyFile = Annotated[
-    Path | None,
-    typer.Option(
-        "--out", help="New file for the key, of mode 0600. Unset: it goes to stdout, once."
-    ),
-]
 
 app = typer.Typer(no_args_is_help=True)
 
@@ -43,12 +34,7 @@ def keys() -> None:
     """Create and revoke API keys; rotate keys; verify erasure receipts."""
 
 
-for _command in (
-    master_keys.master,
-    master_keys.rotate,
-    master_keys.rewrap,
-    master_keys.renew,
-):
+for _command in (master_keys.master, master_keys.rotate, master_keys.rewrap, master_keys.renew):
     app.command()(_command)
 
 
@@ -74,7 +60,10 @@ def create(
             "of a larger false match rate. Unset: the setting `lowest_level`."
         ),
     ] = None,
-    out: KeyFile = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="New file for the key, of mode 0600. Unset: it goes to stdout, once."),
+    ] = None,
 ) -> Result:
     """Create an API key and show it once.
 
@@ -83,14 +72,21 @@ def create(
 
     Example: `veilface keys create --right enroll --right verify --label web-shop`
     """
-    _require_new(out)
+    # Refused before a key is made for it.
+    if out is not None and (out.exists() or not out.parent.is_dir()):
+        raise CommandError(f"{out} is there already, or its folder is not: name another file")
+    expires = None if days is None else utc_now() + timedelta(days=days)
     with opened_store(settings) as store:
         store.tenants.create(tenant)
-        expires = None if days is None else utc_now() + timedelta(days=days)
         made = store.api_keys.create(
             tenant, right, label=label, expires_at=expires, lowest_level=lowest_level, by=operator()
         )
-    return _shown_once(made, f"Key {made.key.prefix} of tenant {tenant}", out)
+    facts = _described(made.key)
+    if out is not None:
+        create_private(out, f"{made.token}\n".encode())
+        return Result({"out": out, **facts})
+    message(f"Key {made.key.prefix} of tenant {tenant}, shown only now:")
+    return Result({"token": made.token, **facts}, made.token)
 
 
 @app.command("list")
@@ -105,24 +101,7 @@ def list_keys(
     Example: `veilface keys list --tenant default`
     """
     with opened_store(settings) as store:
-        keys = store.api_keys.all(tenant=tenant)
-    listing = Table(
-        "API keys",
-        ("prefix", "tenant", "rights", "lowest level", "label", "state", "last used"),
-        [
-            (
-                key.prefix,
-                key.tenant,
-                ", ".join(sorted(key.rights)),
-                key.lowest_level or "any",
-                key.label,
-                _state(key),
-                "never" if key.last_used_at is None else f"{key.last_used_at:%Y-%m-%d %H:%M}",
-            )
-            for key in keys
-        ],
-    )
-    return Result([_described(key) for key in keys], [listing])
+        return Result([_described(key) for key in store.api_keys.all(tenant=tenant)])
 
 
 @app.command()
@@ -141,28 +120,8 @@ def revoke(
     """
     with opened_store(settings) as store:
         revoked = store.api_keys.revoke(prefix, by=operator())
-    facts = {"prefix": prefix, "revoked": revoked}
-    if not revoked:
-        error = "no key of this prefix, or it was revoked before; see `veilface keys list`"
-        return Result(facts, error=error)
-    return Result(facts, f"Key {prefix} is revoked.")
-
-
-def _require_new(out: Path | None) -> None:
-    """Refuse a file that cannot be made, before a key is made for it."""
-    if out is not None and (out.exists() or not out.parent.is_dir()):
-        why = "exists already" if out.exists() else "lies in a folder that does not exist"
-        raise CommandError(f"{out} {why}: name another file with --out")
-
-
-def _shown_once(made: NewApiKey, what: str, out: Path | None, **facts: str) -> Result:
-    """Write the token to a private file, or else to stdout, where nothing else goes."""
-    facts_of_key = {**facts, **_described(made.key)}
-    if out is not None:
-        create_private(out, f"{made.token}\n".encode())
-        return Result({"out": out, **facts_of_key}, f"{what}: {out}")
-    message(f"{what}, shown only now:")
-    return Result({"token": made.token, **facts_of_key}, made.token)
+    error = "no key of this prefix, or it was revoked before; see `veilface keys list`"
+    return Result({"prefix": prefix, "revoked": revoked}, error=None if revoked else error)
 
 
 @app.command("rotate-tenant")
@@ -210,15 +169,11 @@ def rotate_tenant(
                 moved = rotations.move(tenant, binding, by=operator(), progress=advance)
         left = rotations.subjects_of_old_epochs(tenant)
         dropped = 0 if left else rotations.retire(tenant, by=operator())
-    text = [f"Tenant {tenant} is in rotation epoch {epoch}; {moved} templates were turned into it."]
     if left:
-        text += [
-            f"{len(left)} subjects keep an older rotation until they are enrolled again:",
-            *(f"  {subject}" for subject in left),
-            f"Then run `veilface keys rotate-tenant --tenant {tenant} --stolen --finish`.",
-        ]
-    elif dropped:
-        text.append(f"Dropped the keys of {dropped} older epochs.")
+        message(
+            f"{len(left)} subjects keep an older rotation until they are enrolled again. Then run "
+            f"`veilface keys rotate-tenant --tenant {tenant} --stolen --finish`."
+        )
     return Result(
         {
             "tenant": tenant,
@@ -226,8 +181,7 @@ def rotate_tenant(
             "moved": moved,
             "enroll_again": left,
             "rotations_dropped": dropped,
-        },
-        text,
+        }
     )
 
 
@@ -251,36 +205,18 @@ def verify_receipt(
         claims = verify_answer(answer, key)
     except StoreError as error:
         return Result({"valid": False, "reason": str(error)}, error=str(error))
-    return Result({"valid": True, "claims": claims, "key_id": key_fingerprint(key)}, _told(claims))
-
-
-def _told(claims: Mapping[str, Any]) -> list[str]:
-    if "subject" not in claims:
-        counts = {item["item"]: item["count"] for item in claims["erased"]}
-        return [
-            f"Valid: tenant {claims['tenant']} was erased on {claims['erased_at']}, with "
-            f"{counts['subjects']} subjects."
-        ]
-    content = "what was held of" if claims["held"] else "that nothing was held of"
-    verb = "erased" if claims["held"] else "stated"
-    return [
-        f"Valid: tenant {claims['tenant']} {verb} {content} a subject on {claims['erased_at']}.",
-        f"The subject's pseudonym is {claims['subject']}.",
-    ]
-
-
-def _state(key: ApiKey) -> str:
-    if not key.authentic:
-        return "not authentic: `veilface audit-log verify`"
-    if key.revoked_at is not None:
-        return "revoked"
-    if not key.is_valid_at(utc_now()):
-        return "expired"
-    return "valid" if key.expires_at is None else f"valid until {key.expires_at:%Y-%m-%d}"
+    return Result({"valid": True, "claims": claims, "key_id": key_fingerprint(key)})
 
 
 def _described(key: ApiKey) -> dict[str, Any]:
+    """Facts about a key, and its state."""
+    if not key.authentic:
+        state = "not authentic: `veilface audit-log verify`"
+    elif key.revoked_at is not None:
+        state = "revoked"
+    else:
+        state = "valid" if key.is_valid_at(utc_now()) else "expired"
     names = ("prefix", "tenant", "lowest_level", "label")
     times = ("created_at", "expires_at", "revoked_at", "last_used_at")
     facts = {name: getattr(key, name) for name in (*names, *times)}
-    return {**facts, "rights": sorted(key.rights)}
+    return {**facts, "rights": sorted(key.rights), "state": state}

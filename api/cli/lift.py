@@ -2,24 +2,23 @@
 
 import base64
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import typer
 
-from api.cli.console import counted, demo_notice
+from api.cli.console import demo_notice
 from api.cli.errors import CommandError, UsageError
-from api.cli.files import MAX_CONTRACT_BYTES, read_bounded, read_photo
-from api.cli.results import Result, as_json, reports
+from api.cli.files import MAX_CONTRACT_BYTES, Face, naming_photo, read_bounded, read_photos
+from api.cli.options import reports
+from api.cli.results import Result, as_json
 from enroll.enroller import MAX_PHOTOS
 from enroll.public_contract import PublicContract
 from models.errors import ModelError
-from models.pack import ModelPack
 from models.selection import FacePolicy
 from templates.contract.canonical import parse_object
 from templates.decoys import DecoyGenerator
 from templates.keys.private_file import replace_private
-from templates.space.agreement import InconsistentImages
 
 
 @reports()
@@ -31,49 +30,25 @@ def lift(
     *,
     pack: Annotated[Path, typer.Option(help="The model pack of the contract.")],
     generator: Annotated[
-        Path,
-        typer.Option(
-            help="The decoy generator: the bytes of `GET /v1/contract/generator`, or the file "
-            "that `decoys build` wrote."
-        ),
+        Path, typer.Option(help="The decoy generator: `GET /v1/contract/generator`, or the file.")
     ],
     contract: Annotated[
-        Path,
-        typer.Option(
-            help="The JSON of `GET /v1/contract`, or the contract file. Only its public part is "
-            "read."
-        ),
+        Path, typer.Option(help="The JSON of `GET /v1/contract`, or the contract file.")
     ],
     out: Annotated[
-        Path,
-        typer.Option(
-            help="Where the template's bytes go. `-` writes a JSON body for REST to stdout."
-        ),
+        Path, typer.Option(help="File for the template; `-` writes a JSON body to stdout.")
     ],
     probe: Annotated[
         bool, typer.Option("--probe", help="Make a probe for verify, not an enrollment.")
     ] = False,
     level: Annotated[
-        str | None,
-        typer.Option(
-            help="With `--probe --out -`: security level to ask for. Unset: the contract's."
-        ),
+        str | None, typer.Option(help="With `--probe --out -`: security level to ask for.")
     ] = None,
     dim: Annotated[
         int | None,
-        typer.Option(
-            help="Dimension of a probe, one that the contract is calibrated for. Unset: the "
-            "largest of these. An enrollment always has the contract's own."
-        ),
+        typer.Option(help="Dimension of a probe. Unset: the largest that the contract takes."),
     ] = None,
-    face: Annotated[
-        FacePolicy,
-        typer.Option(
-            help="Which face counts in a photo of several: `dominant`, the largest if it covers "
-            "the middle and has twice the area of every other; `largest`, wherever it is; "
-            "`single`, none."
-        ),
-    ] = FacePolicy.DOMINANT,
+    face: Face = FacePolicy.DOMINANT,
 ) -> Result:
     """Make a private template from photos on this machine, without any secret of the service.
 
@@ -86,59 +61,31 @@ def lift(
     Example: `veilface lift me-1.jpg me-2.jpg --pack buffalo_l --generator generator.bin
     --contract contract.json --out me.veil`
     """
-    if len(photos) > MAX_PHOTOS:
-        raise UsageError(f"a template is made from 1 to {MAX_PHOTOS} photos, not {len(photos)}")
     if level is not None and not (probe and str(out) == "-"):
         raise UsageError("--level goes with --probe --out -")
-    public = read_contract(contract)
-    if probe:
-        m = public.probe_dimension(dim)
-    elif dim not in (None, public.binding.m):
+    document = parse_object(read_bounded(contract, MAX_CONTRACT_BYTES), what="the contract")
+    public = PublicContract.read(document)
+    m = public.probe_dimension(dim) if probe else public.binding.m
+    if dim not in (None, m):
         raise UsageError(
-            f"an enrollment under this contract has dimension {public.binding.m}; add --probe to "
-            "make a probe of another one"
+            f"an enrollment under this contract has dimension {m}; add --probe to make a probe of "
+            "another one"
         )
-    else:
-        m = public.binding.m
     decoys = public.require_decoys(DecoyGenerator.load(generator))
     models = public.load_pack(pack)
-    info = models.info
-    rows = np.stack([embed_file(models, photo, policy=face) for photo in photos])
-    try:
-        data = public.lift(rows, decoys, m=m, probe=probe)
-    except InconsistentImages as error:
-        raise CommandError(error.sentence([photo.name for photo in photos])) from None
-    notice = demo_notice(info.embedder_sha256, n=info.n)
+    rows = []
+    for photo, data in zip(photos, read_photos(photos, most=MAX_PHOTOS), strict=True):
+        try:
+            rows.append(models.embed_photo(data, policy=face).embedding)
+        except ModelError as error:
+            raise CommandError(f"{photo.name}: {error}") from None
+    with naming_photo(photos):
+        template = public.lift(np.stack(rows), decoys, m=m, probe=probe)
+    notice = demo_notice(models.info)
     if str(out) == "-":
-        asked = {} if level is None else {"level": level}
-        body = {"template": base64.b64encode(data).decode("ascii"), **asked}
+        body = {"template": base64.b64encode(template).decode("ascii")}
+        body |= {} if level is None else {"level": level}
         return Result(body, as_json(body))
-    replace_private(out, data)
-    kind = "probe" if probe else "enrollment"
-    return Result(
-        {
-            "out": out,
-            "bytes": len(data),
-            "kind": kind,
-            "m": m,
-            "photos": len(photos),
-            "contract_id": public.contract_id,
-            **notice,
-        },
-        f"{out}: {kind} template of {counted(len(photos), 'photo')}, m = {m}, {len(data)} bytes.",
-    )
-
-
-def embed_file(pack: ModelPack, photo: Path, *, policy: FacePolicy) -> np.ndarray[Any, Any]:
-    """Embed one photo file; an error names the file. Returns float32 (n,), unit norm."""
-    data = read_photo(photo)
-    try:
-        return pack.embed_photo(data, policy=policy).embedding
-    except ModelError as error:
-        raise CommandError(f"{photo.name}: {error}") from None
-
-
-def read_contract(path: Path) -> PublicContract:
-    """Read the public part of a contract from a file."""
-    document = parse_object(read_bounded(path, MAX_CONTRACT_BYTES), what="the contract")
-    return PublicContract.read(document)
+    replace_private(out, template)
+    facts = {"out": out, "bytes": len(template), "kind": "probe" if probe else "enrollment", "m": m}
+    return Result({**facts, "photos": len(rows), "contract_id": public.contract_id, **notice})

@@ -2,19 +2,19 @@
 
 import re
 import tempfile
-from collections.abc import Sequence
+from itertools import zip_longest
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
 from api.cli.console import counted, demo_notice, message
 from api.cli.errors import CommandError, UsageError
+from api.cli.options import reports
 from api.cli.pack_download import obtained, shown
-from api.cli.results import Result, Table, reports
+from api.cli.results import Result
 from models.errors import ModelError
 from models.known_packs import KNOWN_PACKS
-from models.liveness import LivenessGraph
 from models.pack import ModelPack, PackInfo
 from models.pack_file import FILE_NAME, pack_file_text
 from models.pack_graphs import read_graphs
@@ -95,14 +95,13 @@ def fetch(
         raise CommandError(f"{target} is there already; remove it, or take another name")
     if not accept_licence:
         raise UsageError("say --accept-licence once you have read the licence of the weights")
-    pins: Sequence[str | None] = sha256 or [None] * len(sources)
     into.mkdir(parents=True, exist_ok=True)
+    digests = {}
     with tempfile.TemporaryDirectory(prefix=".fetch-", dir=into) as scratch:
         # Of the pack's own name, which what is wrong with it names.
         folder = Path(scratch) / name
-        folder.mkdir(parents=True, exist_ok=True)
-        digests = {}
-        for source, pin in zip(sources, pins, strict=True):
+        folder.mkdir()
+        for source, pin in zip_longest(sources, sha256 or []):
             digest, left_out = obtained(source, folder, sha256=pin)
             digests[shown(source)] = digest
             message(f"{shown(source)}: SHA-256 {digest}")
@@ -114,37 +113,8 @@ def fetch(
             replace_public(folder / FILE_NAME, pack_file_text(preprocessing).encode())
         pack = ModelPack.load(folder)
         folder.rename(target)
-    return Result(
-        {"out": target, "sha256": digests, "pack": _described(pack)},
-        f"{target}: {usable(pack.info)}",
-    )
-
-
-def _described(pack: ModelPack) -> dict[str, object]:
-    info = pack.info
-    return {
-        "name": info.name,
-        "n": info.n,
-        "embedder": info.embedder_file.name,
-        "embedder_sha256": info.embedder_sha256,
-        "preprocessing": info.preprocessing,
-        "detector": None if info.detector is None else info.detector.kind,
-        "liveness": [graph.as_dict() for graph in _liveness_graphs(pack)],
-    }
-
-
-def _liveness_graphs(pack: ModelPack) -> Sequence[LivenessGraph]:
-    return () if pack.liveness is None else pack.liveness.members
-
-
-def usable(info: PackInfo) -> str:
-    """Say what a pack gives, and what it takes."""
-    detector = (
-        "no detector: photos must be aligned square crops"
-        if info.detector is None
-        else f"detector {info.detector.kind}"
-    )
-    return f"{info.n} numbers per embedding, {detector}."
+    facts = {"out": target, "sha256": digests, "pack": _described(pack)}
+    return Result(facts, f"{target}: {usable(pack.info)}")
 
 
 @app.command()
@@ -162,35 +132,36 @@ def inspect(
 
     Example: `veilface models inspect ~/.insightface/models/buffalo_l`
     """
-    graphs = read_graphs(pack)
-    loaded, refusal = None, None
+    names = ("file", "role", "reason", "sha256", "inputs", "outputs")
+    graphs = [{name: getattr(graph, name) for name in names} for graph in read_graphs(pack)]
+    facts: dict[str, Any] = {"usable": True, "reason": None, "graphs": graphs, "pack": None}
     try:
         loaded = ModelPack.load(pack)
     except ModelError as error:
-        refusal = str(error)
-    text: list[str | Table] = [
-        Table(
-            f"Graphs of {pack.name}",
-            ("file", "role", "why", "SHA-256"),
-            [(graph.file, graph.role, graph.reason, graph.sha256[:16]) for graph in graphs],
-        )
-    ]
-    if loaded is None:
-        text.append(f"This pack cannot be used: {refusal}")
-    else:
-        demo_notice(loaded.info.embedder_sha256, n=loaded.info.n)
-        text.append(f"Usable: {usable(loaded.info)}")
-        text += [
-            f"Liveness: {graph.file}, {graph.stated.crop} of the face times {graph.crop_scale:g}, "
-            f"{graph.size} x {graph.size} {graph.stated.channel_order.upper()}, class "
-            f"{graph.stated.live_class} is live."
-            for graph in _liveness_graphs(loaded)
-        ]
-    names = ("file", "role", "reason", "sha256", "inputs", "outputs")
-    facts = {
-        "usable": loaded is not None,
-        "reason": refusal,
-        "graphs": [{name: getattr(graph, name) for name in names} for graph in graphs],
-        "pack": None if loaded is None else _described(loaded),
+        return Result(facts | {"usable": False, "reason": str(error)}, status=1)
+    demo_notice(loaded.info)
+    return Result(facts | {"pack": _described(loaded)})
+
+
+def usable(info: PackInfo) -> str:
+    """Say what a pack gives, and what it takes."""
+    detector = (
+        "no detector: photos must be aligned square crops"
+        if info.detector is None
+        else f"detector {info.detector.kind}"
+    )
+    return f"{info.n} numbers per embedding, {detector}."
+
+
+def _described(pack: ModelPack) -> dict[str, Any]:
+    info = pack.info
+    graphs = () if pack.liveness is None else pack.liveness.members
+    return {
+        "name": info.name,
+        "n": info.n,
+        "embedder": info.embedder_file.name,
+        "embedder_sha256": info.embedder_sha256,
+        "preprocessing": info.preprocessing,
+        "detector": None if info.detector is None else info.detector.kind,
+        "liveness": [graph.as_dict() for graph in graphs],
     }
-    return Result(facts, text, status=0 if loaded is not None else 1)

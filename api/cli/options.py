@@ -1,40 +1,28 @@
-"""Options that several commands share, and settings as flags.
+"""Flags that commands share: settings, ``--json`` and ``--plan``.
 
-A setting is declared once, in ``api.settings``. A command that takes settings names them, and
-gets one flag for each with the same help, and the :class:`Settings` that result.
+A setting is declared once, in ``api.settings``. A command is a function from flags to a
+:class:`Result`; the decorator :func:`reports` gives it a flag for each setting that it names, with
+the same help, and the :class:`Settings` that result.
 """
 
 import functools
 import inspect
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+import tomllib
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, ParamSpec, TypeVar
+from typing import Annotated, Any
 
 import typer
 from pydantic.fields import FieldInfo
 
 from api.cli.errors import UsageError
+from api.cli.results import Result, present
 from api.service.environment import variables_set
 from api.settings import CONFIG_VARIABLE, ENV_PREFIX, Settings, load_settings
-from templates.errors import TemplateError
 
-P = ParamSpec("P")
-R = TypeVar("R")
+STORE = ("data_dir", "database_url", "master_key_file", "master_key_variable")
 
-STORE = (
-    "data_dir",
-    "database_url",
-    "master_key_file",
-    "master_key_variable",
-)
-LOCAL = (*STORE, "pack", "providers", "onnx_threads")
-
-AsJson = Annotated[
-    bool, typer.Option("--json", help="Write JSON to stdout; messages stay on stderr.")
-]
 Tenant = Annotated[str, typer.Option(help="Tenant.")]
-
 Device = Annotated[
     str,
     typer.Option(
@@ -43,81 +31,70 @@ Device = Annotated[
     ),
 ]
 PROCESSOR = "cpu"
-DEFAULT_DIM = 64
-"""Dimension that an audit attacks where it is told none."""
 
 
-def quick(**smaller: Any) -> Any:
-    """Make the option ``--quick``: it takes these defaults for options that are not given."""
-
-    def choose(ctx: typer.Context, asked: bool) -> bool:
-        if asked:
-            ctx.default_map = {**smaller, **(ctx.default_map or {})}
-        return asked
-
-    said = " ".join(f"--{name.replace('_', '-')} {value}" for name, value in smaller.items())
-    return typer.Option(
-        "--quick", is_eager=True, callback=choose, help=f"A first look in minutes: `{said}`."
-    )
-
-
-def chosen_device(device: str) -> str | None:
-    """Check that this machine has a device; None for the processor."""
+def torch_device(device: str) -> str | None:
+    """Return a device of torch that this machine has; None for `cpu`."""
     if device == PROCESSOR:
         return None
     # Imported here: a command without the flag starts sooner.
     from templates.distances import require_device
 
-    try:
-        require_device(device)
-    except TemplateError as error:
-        raise UsageError(f"{error}; leave out --device to use the processor") from None
+    require_device(device)
     return device
 
 
-def takes_settings(*names: str) -> Callable[[Callable[..., R]], Callable[..., R]]:
-    """Give a command a flag for each named setting, and ``--config``.
+def reports(*settings: str) -> Callable[[Callable[..., Result | None]], Callable[..., None]]:
+    """Give a command flags for settings and ``--json``, and show what it returns.
 
-    The command's parameter ``settings`` receives what flags, environment and TOML file say.
+    Its parameter ``settings`` receives what flags, environment and TOML file say. A command that
+    returns None has shown everything itself, and takes no ``--json``.
     """
 
-    def decorate(command: Callable[..., R]) -> Callable[..., R]:
-        def run(**given: Any) -> R:
-            flags = {name: given.pop(name) for name in names}
-            with configured_by(given.pop("config")):
-                return command(settings=load_settings(**flags), **given)
+    def decorate(command: Callable[..., Result | None]) -> Callable[..., None]:
+        signature = inspect.signature(command)
 
-        flags = [_flag(name, Settings.model_fields[name]) for name in names]
-        return shown_as(run, command, _CONFIG, *flags)
+        def run(*, as_json: bool = False, config: Path | None = None, **given: Any) -> None:
+            # A file that is named here wins over the variable, in workers too.
+            with variables_set({} if config is None else {CONFIG_VARIABLE: str(config)}):
+                if settings:
+                    flags = {name: given.pop(name) for name in settings}
+                    given["settings"] = load_settings(**flags)
+                result = command(**given)
+            if result is not None:
+                present(result, json=as_json)
+
+        flags = [_flag(name, Settings.model_fields[name]) for name in settings]
+        shown = [
+            *(each for each in signature.parameters.values() if each.name != "settings"),
+            *([_CONFIG, *flags] if settings else []),
+            *([] if signature.return_annotation is None else [_AS_JSON]),
+        ]
+        shown = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in shown]
+        functools.update_wrapper(run, command)
+        del run.__wrapped__  # type: ignore[attr-defined]
+        run.__signature__ = inspect.Signature(shown)  # type: ignore[attr-defined]
+        run.__annotations__ = {each.name: each.annotation for each in shown}
+        return run
 
     return decorate
 
 
-def shown_as(
-    run: Callable[..., R], command: Callable[..., Any], *added: inspect.Parameter
-) -> Callable[..., R]:
-    """Let Typer show ``run`` with the parameters of ``command``, but ``settings``, and more."""
-    own = [p for p in inspect.signature(command).parameters.values() if p.name != "settings"]
-    parameters = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in (*own, *added)]
-    functools.update_wrapper(run, command)
-    del run.__wrapped__  # type: ignore[attr-defined]
-    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-    run.__annotations__ = {p.name: p.annotation for p in parameters}
-    return run
+def _option(name: str, default: Any, annotation: Any) -> inspect.Parameter:
+    return inspect.Parameter(
+        name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation
+    )
 
 
-@contextmanager
-def configured_by(file: Path | None) -> Iterator[None]:
-    """Let the TOML file named on the command line win over ``VEILFACE_CONFIG`` in the block."""
-    with variables_set({} if file is None else {CONFIG_VARIABLE: str(file)}):
-        yield
-
-
-_CONFIG = inspect.Parameter(
+_AS_JSON = _option(
+    "as_json",
+    False,
+    Annotated[bool, typer.Option("--json", help="Write JSON to stdout; messages stay on stderr.")],
+)
+_CONFIG = _option(
     "config",
-    inspect.Parameter.KEYWORD_ONLY,
-    default=None,
-    annotation=Annotated[
+    None,
+    Annotated[
         Path | None,
         typer.Option(
             help=f"TOML file with settings. Unset: `{CONFIG_VARIABLE}`, then `veilface.toml`.",
@@ -125,18 +102,15 @@ _CONFIG = inspect.Parameter(
         ),
     ],
 )
-_KINDS: dict[Any, Any] = {
-    Path: Path,
-    int: int,
-    float: float,
-    bool: bool,
-    Path | None: Path,
-    int | None: int,
-}
+_KINDS: dict[Any, Any] = {Path | None: Path, int | None: int}
+_KINDS |= {kind: kind for kind in (Path, int, float, bool)}
 
 
 def _flag(name: str, declared: FieldInfo) -> inspect.Parameter:
-    shown = "" if declared.default is None else f" Default: `{_shown(declared.default)}`."
+    default = declared.default
+    if isinstance(default, tuple):
+        default = ",".join(default)
+    shown = "" if default is None else f" Default: `{default}`."
     flag = name.replace("_", "-")
     kind = _KINDS.get(declared.annotation, str)
     option = typer.Option(
@@ -144,13 +118,36 @@ def _flag(name: str, declared: FieldInfo) -> inspect.Parameter:
         help=f"{declared.description}{shown} Variable: `{ENV_PREFIX}{name.upper()}`.",
         rich_help_panel="Settings",
     )
-    return inspect.Parameter(
-        name,
-        inspect.Parameter.KEYWORD_ONLY,
-        default=None,
-        annotation=Annotated[kind | None, option],
-    )
+    return _option(name, None, Annotated[kind | None, option])
 
 
-def _shown(value: Any) -> str:
-    return ",".join(value) if isinstance(value, tuple) else str(value)
+def _read_plan(ctx: typer.Context, file: Path | None) -> Path | None:
+    """Take a plan's values as the defaults of the flags that it names."""
+    if file is None:
+        return None
+    try:
+        values = tomllib.loads(file.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise UsageError(f"--plan {file} cannot be read as TOML: {error}") from None
+    names = {
+        flag.lstrip("-").replace("-", "_"): str(parameter.name)
+        for parameter in ctx.command.params
+        for flag in (*parameter.opts, str(parameter.name))
+        if "--plan" not in parameter.opts
+    }
+    chosen = {name.replace("-", "_"): value for name, value in values.items()}
+    if unknown := sorted(chosen.keys() - names.keys()):
+        raise UsageError(f"--plan {file} names no option of this command: {', '.join(unknown)}")
+    ctx.default_map = {names[name]: value for name, value in chosen.items()}
+    return file
+
+
+Plan = Annotated[
+    Path | None,
+    typer.Option(
+        "--plan",
+        is_eager=True,
+        callback=_read_plan,
+        help="A TOML file with options, named as their flags; flags that are given win.",
+    ),
+]

@@ -9,7 +9,7 @@ from typing import IO
 
 import httpx
 
-from api.cli.console import download
+from api.cli.console import progress
 from api.cli.errors import CommandError
 from models.archive import MAX_FILE_BYTES, is_archive, unpack
 
@@ -85,10 +85,9 @@ def _download(source: str, draft: IO[bytes], *, is_pinned: bool) -> None:
                     f"{shown(source)} leads over plain http, where anybody on the way may change "
                     "the file: use https, or pin it with --sha256"
                 )
-            if answer.status_code != httpx.codes.OK:
-                raise CommandError(f"{shown(source)} answers {answer.status_code}")
+            answer.raise_for_status()
             size = answer.headers.get("content-length", "")
-            with download("fetching", int(size) if size.isdecimal() else None) as advance:
+            with progress("fetching", int(size) if size.isdecimal() else None) as advance:
                 for piece in answer.iter_bytes(2**18):
                     if draft.tell() + len(piece) > MAX_FILE_BYTES:
                         raise _too_large(source)

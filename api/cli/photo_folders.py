@@ -2,8 +2,7 @@
 
 import csv
 import unicodedata
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
 from api.cli.console import message
@@ -26,11 +25,17 @@ def find_photos(folder: Path) -> list[Path]:
     photos = [file for file in files if is_photo(file)]
     if not photos:
         raise CommandError(f"{folder} has no file in {_ENDINGS}, at any depth")
-    others = [str(file.relative_to(folder)) for file in files if not is_photo(file)]
-    _tell_others(folder, others)
     distinct = distinct_files(photos)
-    _tell_copies(folder, len(photos) - len(distinct))
+    others = [str(file.relative_to(folder)) for file in files if not is_photo(file)]
+    _note_unread(folder, others, copies=len(photos) - len(distinct))
     return distinct
+
+
+def photos_of(folders: Sequence[Path], names: Collection[str]) -> tuple[list[Path], int]:
+    """Photos of folders without those of the names, each once; and how many were left out."""
+    folder_of = {photo: folder for folder in folders for photo in find_photos(folder)}
+    kept = [photo for photo, folder in folder_of.items() if not _is_named(photo, folder, names)]
+    return kept, len(folder_of) - len(kept)
 
 
 def labelled_people(folder: Path) -> LabelledFolder:
@@ -39,14 +44,17 @@ def labelled_people(folder: Path) -> LabelledFolder:
     What is left out is named to the person.
     """
     labelled = labelled_folder(folder)
-    albums: dict[str, list[Path]] = {}
-    for path, name in zip(labelled.paths, labelled.identities, strict=True):
-        albums.setdefault(name, []).append(path)
-    kept = [(path, name) for name, album in albums.items() for path in distinct_files(album)]
-    _tell_others(folder, labelled.ignored)
-    _tell_copies(folder, len(labelled) - len(kept))
-    paths, identities = zip(*kept, strict=True)
-    return replace(labelled, paths=paths, identities=identities)
+    distinct = {name: distinct_files(album) for name, album in labelled.albums.items()}
+    copies = len(labelled) - sum(map(len, distinct.values()))
+    _note_unread(folder, labelled.ignored, copies=copies)
+    return labelled.having(distinct)
+
+
+def people_or_faces(folder: Path) -> LabelledFolder:
+    """:func:`labelled_people`; or, of a folder without subfolders, each photo as a person."""
+    if not folder.is_dir() or any(entry.is_dir() for entry in visible(folder)):
+        return labelled_people(folder)
+    return photos_alone(folder, find_photos(folder))
 
 
 def albums_of(source: Path) -> tuple[dict[str, list[Path]], dict[str, str]]:
@@ -59,13 +67,13 @@ def albums_of(source: Path) -> tuple[dict[str, list[Path]], dict[str, str]]:
     from templates.store.identifiers import InvalidIdentifier, checked_subject_id
 
     if source.is_dir():
-        labelled = labelled_people(source)
-        named = list(zip(labelled.identities, labelled.paths, strict=True))
+        albums = labelled_people(source).albums
+        photos = [(name, photo) for name, album in albums.items() for photo in album]
     else:
-        named = _listed_photos(source)
-    albums: dict[str, list[Path]] = {}
+        photos = _listed_photos(source)
+    albums = {}
     left_out: dict[str, str] = {}
-    for name, photo in named:
+    for name, photo in photos:
         try:
             albums.setdefault(checked_subject_id(name), []).append(photo)
         except InvalidIdentifier as error:
@@ -81,20 +89,17 @@ def _listed_photos(file: Path) -> list[tuple[str, Path]]:
     try:
         with file.open(encoding="utf-8-sig", newline="") as stream:
             rows = list(csv.DictReader(stream))
-    except FileNotFoundError:
-        raise UsageError(f"{file} is neither a folder nor a CSV file") from None
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise UsageError(f"{file} cannot be read as CSV: {error}") from None
+        raise UsageError(f"{file} is neither a folder nor a CSV file: {error}") from None
     if not rows or not all(row.get("subject") and row.get("photo") for row in rows):
         raise UsageError(f"{file} needs the columns subject,photo, and both on every line")
     return [(row["subject"], file.parent / row["photo"]) for row in rows]
 
 
-def people_or_faces(folder: Path) -> LabelledFolder:
-    """:func:`labelled_people`; or, of a folder without subfolders, each photo as a person."""
-    if not folder.is_dir() or any(entry.is_dir() for entry in visible(folder)):
-        return labelled_people(folder)
-    return photos_alone(folder, find_photos(folder))
+def _is_named(photo: Path, folder: Path, names: Collection[str]) -> bool:
+    """Whether a photo of the folder, or a person whose folder it is in, has one of the names."""
+    relative = photo.relative_to(folder)
+    return not {relative.as_posix(), *relative.parts[:-1]}.isdisjoint(names)
 
 
 def _files_below(folder: Path) -> Iterator[Path]:
@@ -105,15 +110,12 @@ def _files_below(folder: Path) -> Iterator[Path]:
             yield entry
 
 
-def _tell_others(folder: Path, others: Sequence[str]) -> None:
+def _note_unread(folder: Path, others: Sequence[str], *, copies: int) -> None:
     if others:
         more = ", …" if len(others) > _MOST_NAMED else ""
         message(
             f"note: not read in {folder}: {', '.join(others[:_MOST_NAMED])}{more} ({len(others):,} "
             f"in all; photos end in {_ENDINGS})"
         )
-
-
-def _tell_copies(folder: Path, copies: int) -> None:
     if copies:
         message(f"note: copies of another photo in {folder} do not count: {copies:,}")

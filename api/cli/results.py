@@ -1,25 +1,17 @@
-"""What a command found, and the one place that shows it: as text, or as JSON with ``--json``.
-
-A command is a function from flags to a :class:`Result`. The decorator :func:`reports` gives it its
-flags for settings and ``--json``, shows the result, and sets the exit status.
-"""
+"""What a command found, and the one place that shows it: as text, or as JSON with ``--json``."""
 
 import dataclasses
-import inspect
 import json
 import sys
-import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 
 from api.cli.console import message, say
-from api.cli.errors import UsageError
-from api.cli.options import AsJson, shown_as, takes_settings
 
 
 @dataclass(frozen=True)
@@ -41,7 +33,8 @@ class Result:
         What ``--json`` writes: a mapping, a list or a dataclass. It may hold paths, times, and
         objects with a method ``to_json``.
     text
-        What a person reads instead: lines and tables, in order.
+        What a person reads instead: lines and tables, in order. None: the facts, a line for each
+        value and a table for each list of records.
     error
         What is wrong, on stderr after either; the exit status is then 1.
     status
@@ -49,7 +42,7 @@ class Result:
     """
 
     facts: Any
-    text: str | Sequence[str | Table] = ()
+    text: str | Sequence[str | Table] | None = None
     error: str | None = None
     status: int = 0
 
@@ -76,18 +69,44 @@ def present(result: Result, *, json: bool) -> None:
     if json:
         say(as_json(result.facts))
     else:
-        for part in [result.text] if isinstance(result.text, str) else result.text:
-            if isinstance(part, str):
-                say(part)
-            else:
-                _show(part)
+        text = shown_facts(result.facts) if result.text is None else result.text
+        for part in [text] if isinstance(text, str) else text:
+            say(part if isinstance(part, str) else _drawn(part))
     if result.error is not None:
         message(f"error: {result.error}")
     if status := result.status or int(result.error is not None):
         raise typer.Exit(status)
 
 
-def _show(table: Table) -> None:
+def shown_facts(facts: Any, name: str = "") -> Iterator[str | Table]:
+    """Show facts: a line for each value, a table for each list of records."""
+    value = json.loads(as_json(facts))
+    if isinstance(value, dict):
+        for part, inner in value.items():
+            yield from shown_facts(inner, f"{name} {part.replace('_', ' ')}".strip())
+    elif isinstance(value, list) and value and isinstance(value[0], dict):
+        columns = [column.replace("_", " ") for column in value[0]]
+        yield Table(name, columns, [[_cell(cell) for cell in row.values()] for row in value])
+    else:
+        yield f"{name}: {_cell(value)}"
+
+
+def _cell(value: Any) -> str:
+    match value:
+        case None | []:
+            return "none"
+        case bool():
+            return "yes" if value else "no"
+        case float():
+            return f"{value:.4g}"
+        case list():
+            return ", ".join(map(_cell, value))
+        case dict():
+            return ", ".join(f"{name} {_cell(inner)}" for name, inner in value.items())
+    return str(value)
+
+
+def _drawn(table: Table) -> str:
     from rich.console import Console
     from rich.table import Table as Listing
 
@@ -101,56 +120,4 @@ def _show(table: Table) -> None:
     console = Console(file=sys.stdout, width=width, markup=False)
     with console.capture() as captured:
         console.print(listing)
-    say(captured.get().removesuffix("\n"))
-
-
-_AS_JSON = inspect.Parameter(
-    "as_json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=AsJson
-)
-
-
-def reports(*settings: str) -> Callable[[Callable[..., Result]], Callable[..., None]]:
-    """Give a command that returns a :class:`Result` flags for settings, and ``--json``."""
-
-    def decorate(command: Callable[..., Result]) -> Callable[..., None]:
-        inner = takes_settings(*settings)(command) if settings else command
-
-        def run(*, as_json: bool, **given: Any) -> None:
-            present(inner(**given), json=as_json)
-
-        return shown_as(run, inner, _AS_JSON)
-
-    return decorate
-
-
-def _read_plan(ctx: typer.Context, file: Path | None) -> Path | None:
-    """Take a plan's values as the defaults of the flags that it names."""
-    if file is None:
-        return None
-    try:
-        values: Mapping[str, Any] = tomllib.loads(file.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise UsageError(f"--plan {file} cannot be read as TOML: {error}") from None
-    names = {
-        flag.lstrip("-").replace("-", "_"): str(parameter.name)
-        for parameter in ctx.command.params
-        for flag in (*parameter.opts, str(parameter.name))
-        if "--plan" not in parameter.opts
-    }
-    chosen = {name.replace("-", "_"): value for name, value in values.items()}
-    if unknown := sorted(chosen.keys() - names.keys()):
-        raise UsageError(f"--plan {file} names no option of this command: {', '.join(unknown)}")
-    values = {names[name]: value for name, value in chosen.items()}
-    ctx.default_map = {**(ctx.default_map or {}), **values}
-    return file
-
-
-Plan = Annotated[
-    Path | None,
-    typer.Option(
-        "--plan",
-        is_eager=True,
-        callback=_read_plan,
-        help="A TOML file with options, named as their flags; flags that are given win.",
-    ),
-]
+    return captured.get().removesuffix("\n")

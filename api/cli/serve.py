@@ -10,7 +10,7 @@ import typer
 
 from api.cli.console import demo_notice, message, say
 from api.cli.errors import CommandError
-from api.cli.options import STORE, takes_settings
+from api.cli.options import STORE, reports
 from api.cli.verdict import verdict_lines
 from api.limits.rates import RateLimits
 from api.service.opening import (
@@ -32,7 +32,7 @@ FLAGS = (
 """The settings that one changes by hand; the others come from the environment and the file."""
 
 
-@takes_settings(*FLAGS)
+@reports(*FLAGS)
 def serve(
     *,
     settings: Settings,
@@ -49,26 +49,21 @@ def serve(
 
     Example: `veilface serve --pack buffalo_l --data-dir veilface-data --workers 2`
     """
-    with _ended_by_sigterm(), _opened(settings, check=check) as deployment:
-        if check:
-            say("Everything fits together: contract, decoys, pack, database and master key.")
-            return
-        with listen(settings) as listener:
-            port = listener.getsockname()[1]
-            message(f"Veilface listens on {service_url(settings, port=port)}")
-            try:
-                run_server(deployment, listener)
-            except SystemExit as error:
-                if error.code:
-                    raise CommandError("the service did not start; its log says why") from None
-
-
-@contextmanager
-def _ended_by_sigterm() -> Iterator[None]:
-    """End by SIGTERM, cleaning up, while the server has no handler yet: process 1 ignores it."""
+    # Process 1 ignores SIGTERM while the server has no handler yet.
     before = signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     try:
-        yield
+        with _opened(settings, check=check) as deployment:
+            if check:
+                say("Everything fits together: contract, decoys, pack, database and master key.")
+                return
+            with listen(settings) as listener:
+                port = listener.getsockname()[1]
+                message(f"Veilface listens on {service_url(settings, port=port)}")
+                try:
+                    run_server(deployment, listener)
+                except SystemExit as error:
+                    if error.code:
+                        raise CommandError("the service did not start; its log says why") from None
     finally:
         signal.signal(signal.SIGTERM, before)
 
@@ -93,8 +88,7 @@ def _opened(settings: Settings, *, check: bool) -> Iterator[Deployment]:
     with closing(deployment):
         prepare_database(deployment.store)
         contract = deployment.contract
-        binding = contract.binding
-        if demo_notice(binding.embedder_sha256, n=binding.n):
+        if demo_notice(contract.binding):
             deployment.settings = settings.model_copy(update={"demo": True})
         if warning := key_beside_database(settings):
             message(f"warning: {warning}")

@@ -10,34 +10,26 @@ import typer
 
 from api.cli.console import counted, demo_notice, message, progress
 from api.cli.errors import CommandError, UsageError, sentence
-from api.cli.files import read_photo
-from api.cli.options import LOCAL, Tenant
+from api.cli.files import Face, naming_photo, read_photos
+from api.cli.options import STORE, Tenant, reports
 from api.cli.photo_folders import albums_of
-from api.cli.results import Result, Table, reports
+from api.cli.results import Result, Table
 from api.http.audit import operator
 from api.http.errors import ApiError
 from api.service.opening import prepare_database, weak_privacy
 from api.service.runtime import Runtime
 from api.settings import DEFAULT_TENANT, Settings
 from enroll.enroller import MAX_PHOTOS
-from models.errors import ModelError, PhotoRejected
+from models.errors import ModelError
 from models.pack import ModelPack
 from models.selection import FacePolicy
 from templates.errors import StoreBusy, StoreUnavailable, VeilfaceError
-from templates.space.agreement import InconsistentImages
 from templates.store.audit_log import Entry
 from templates.store.identifiers import checked_subject_id
 from templates.store.schema import Source
 from verify import MAX_PROBE_PHOTOS, probe_of_photos
 
-Subject = Annotated[str, typer.Argument(help="Id of the person.")]
-Face = Annotated[
-    FacePolicy,
-    typer.Option(
-        help="Which face counts in a photo of several: `dominant`, the largest if it covers the "
-        "middle and has twice the area of every other; `largest`, wherever it is; `single`, none."
-    ),
-]
+LOCAL = (*STORE, "pack", "providers", "onnx_threads")
 
 
 @reports(*LOCAL)
@@ -73,24 +65,18 @@ def enroll(
 
     Example: `veilface enroll alice alice-1.jpg alice-2.jpg alice-3.jpg --pack buffalo_l`
     """
-    if people is not None:
-        if subject is not None:
-            raise UsageError("--from enrolls many: no SUBJECT beside it")
-        albums, left_out = albums_of(people)
-        with _opened(settings, tenant) as entrance:
-            return _enrolled_all(entrance, albums, left_out, face)
-    if subject is None or not photos:
-        raise UsageError("name a person and 1 to 10 photos; or many people with --from")
-    if len(photos) > MAX_PHOTOS:
-        raise UsageError(f"an enrollment has 1 to {MAX_PHOTOS} photos, not {len(photos)}")
+    if (people is None) == (subject is None) or (subject is not None and not photos):
+        raise UsageError("name a person and 1 to 10 photos; or many people with --from, alone")
+    albums, left_out = ({}, {}) if people is None else albums_of(people)
     with _opened(settings, tenant) as entrance:
-        facts = _enrolled(entrance, checked_subject_id(subject), photos, face)
-        _note_privacy(entrance.runtime)
-    done = "Replaced the enrollment of" if facts["replaced"] else "Enrolled"
-    return Result(
-        {**facts, "tenant": entrance.tenant, **_notice(entrance.pack)},
-        f"{done} {subject} from {counted(len(photos), 'photo')}.",
-    )
+        if subject is not None:
+            facts = entrance.enroll(checked_subject_id(subject), photos or [], face)
+            result = Result({**facts, "tenant": entrance.tenant, **demo_notice(entrance.pack.info)})
+        else:
+            result = _enroll_all(entrance, albums, left_out, face)
+        if (weakness := weak_privacy(entrance.runtime.contract)) is not None:
+            message(f"note: privacy is not proven: {weakness}")
+    return result
 
 
 @dataclass(frozen=True)
@@ -101,12 +87,47 @@ class _Entrance:
     pack: ModelPack
     tenant: str
 
+    def enroll(self, subject: str, photos: Sequence[Path], face: FacePolicy) -> dict[str, Any]:
+        """Enroll somebody from photos; returned is what ``--json`` says of it."""
+        data = read_photos(photos, most=MAX_PHOTOS)
+        epoch = self.runtime.current_epoch(self.tenant)
+        with naming_photo(photos):
+            enrollment = epoch.enroller.from_photos(self.pack, data, policy=face)
+        stored = self.runtime.put(
+            self.tenant,
+            subject,
+            epoch,
+            enrollment,
+            source=Source.PHOTOS,
+            photos=len(photos),
+            by=operator(),
+        )
+        return {
+            "subject_id": subject,
+            "template_id": stored.template_id,
+            "contract_id": enrollment.contract_id,
+            "replaced": not stored.created,
+            "photos": len(photos),
+        }
 
-def _enrolled_all(
-    entrance: _Entrance,
-    albums: dict[str, list[Path]],
-    left_out: dict[str, str],
-    face: FacePolicy,
+
+@contextmanager
+def _opened(settings: Settings, tenant: str) -> Iterator[_Entrance]:
+    """Open the deployment; only the default tenant is made where it is missing."""
+    runtime = Runtime.open(settings)
+    try:
+        prepare_database(runtime.store)
+        if runtime.pack is None:
+            raise UsageError("photos need a model pack; name it with --pack")
+        tenants = runtime.store.tenants
+        known = tenants.create(tenant) if tenant == DEFAULT_TENANT else tenants.get(tenant)
+        yield _Entrance(runtime, runtime.pack, known.name)
+    finally:
+        runtime.close()
+
+
+def _enroll_all(
+    entrance: _Entrance, albums: dict[str, list[Path]], left_out: dict[str, str], face: FacePolicy
 ) -> Result:
     """Enroll everybody who can be, and say who could not and why.
 
@@ -116,11 +137,10 @@ def _enrolled_all(
     failed = dict(left_out)
     outage: str | None = None
     with progress("enrolling people", len(albums)) as advance:
-        for subject, album in albums.items():
+        for subject, photos in albums.items():
             try:
                 if outage is None:
-                    photos = album[:MAX_PHOTOS]
-                    enrolled.append(_enrolled(entrance, subject, photos, face))
+                    enrolled.append(entrance.enroll(subject, photos[:MAX_PHOTOS], face))
                 else:
                     failed[subject] = outage
             except (VeilfaceError, ModelError, OSError) as error:
@@ -128,12 +148,9 @@ def _enrolled_all(
                 if isinstance(error, StoreUnavailable) and not isinstance(error, StoreBusy):
                     outage = failed[subject]
             advance(1)
-    _note_privacy(entrance.runtime)
-    used = sum(one["photos"] for one in enrolled)
+    used = counted(sum(one["photos"] for one in enrolled), "photo")
     people = len(enrolled) + len(failed)
-    report: list[str | Table] = [
-        f"Enrolled {len(enrolled):,} of {people:,} people, from {counted(used, 'photo')}."
-    ]
+    report: list[str | Table] = [f"Enrolled {len(enrolled):,} of {people:,} people, from {used}."]
     if failed:
         several = "A photo that shows several faces may be taken with --face largest."
         report[:0] = [Table("Not enrolled", ("person", "why"), [*failed.items()]), several]
@@ -142,55 +159,16 @@ def _enrolled_all(
             "tenant": entrance.tenant,
             "enrolled": enrolled,
             "failed": [{"subject_id": name, "message": why} for name, why in failed.items()],
-            **_notice(entrance.pack),
+            **demo_notice(entrance.pack.info),
         },
         report,
         status=1 if failed else 0,
     )
 
 
-def _enrolled(
-    entrance: _Entrance,
-    subject: str,
-    photos: Sequence[Path],
-    face: FacePolicy,
-) -> dict[str, Any]:
-    """Enroll somebody from photos; returned is what ``--json`` says of it."""
-    runtime, tenant = entrance.runtime, entrance.tenant
-    data = [read_photo(photo) for photo in photos]
-    epoch = runtime.current_epoch(tenant)
-    with _named(photos):
-        enrollment = epoch.enroller.from_photos(entrance.pack, data, policy=face)
-    stored = runtime.put(
-        tenant,
-        subject,
-        epoch,
-        enrollment,
-        source=Source.PHOTOS,
-        photos=len(photos),
-        by=operator(),
-    )
-    return {
-        "subject_id": subject,
-        "template_id": stored.template_id,
-        "contract_id": enrollment.contract_id,
-        "replaced": not stored.created,
-        "photos": len(photos),
-    }
-
-
-def _note_privacy(runtime: Runtime) -> None:
-    if (weakness := weak_privacy(runtime.contract)) is not None:
-        message(f"note: privacy is not proven: {weakness}")
-
-
-def _notice(pack: ModelPack) -> dict[str, str]:
-    return demo_notice(pack.info.embedder_sha256, n=pack.info.n)
-
-
 @reports(*LOCAL)
 def verify(
-    subject: Subject,
+    subject: Annotated[str, typer.Argument(help="Id of the person.")],
     photos: Annotated[
         list[Path],
         typer.Argument(
@@ -219,9 +197,7 @@ def verify(
 
     Example: `veilface verify alice now-1.jpg now-2.jpg now-3.jpg --pack buffalo_l --level fmr-1e-4`
     """
-    if len(photos) > MAX_PROBE_PHOTOS:
-        raise UsageError(f"a verification takes 1 to {MAX_PROBE_PHOTOS} photos, not {len(photos)}")
-    data = [read_photo(photo) for photo in photos]
+    data = read_photos(photos, most=MAX_PROBE_PHOTOS)
     with _opened(settings, tenant) as entrance:
         runtime, pack, name = entrance.runtime, entrance.pack, entrance.tenant
         read = runtime.read(name, subject)
@@ -232,7 +208,7 @@ def verify(
             level = runtime.levels.in_force(level)
         except ApiError as error:
             raise UsageError(error.message) from None
-        with _named(photos):
+        with naming_photo(photos):
             probe = probe_of_photos(pack, runtime.contract, data, passive=False, policy=face)
         decision = verifier.decide_embedding(
             probe.embedding, template, level=level, photos=probe.photos
@@ -243,47 +219,9 @@ def verify(
         runtime.store.audit_log.record(
             Entry("verify-locally", outcome, operator(), name, pseudonym)
         )
-    advice = [] if decision.advice is None else [decision.advice]
+    names = ("reason", "level", "fmr", "contract_id", "calibration_id", "advice")
+    facts = {name: getattr(decision, name) for name in names}
     return Result(
-        {
-            "decision": outcome,
-            "reason": decision.reason,
-            "level": decision.level,
-            "fmr": decision.fmr,
-            "contract_id": decision.contract_id,
-            "calibration_id": decision.calibration_id,
-            **({"advice": decision.advice} if advice else {}),
-            **_notice(pack),
-        },
-        [f"{outcome}: {subject}, level {decision.level}, FMR {decision.fmr:g}", *advice],
+        {"decision": outcome, **facts, **demo_notice(pack.info)},
         status=0 if decision.accepted else 1,
     )
-
-
-@contextmanager
-def _named(photos: Sequence[Path]) -> Iterator[None]:
-    """Say of what is wrong with a photo which file it is."""
-    try:
-        yield
-    except PhotoRejected as error:
-        raise CommandError(f"{photos[error.index].name}: {error.cause}") from None
-    except InconsistentImages as error:
-        raise CommandError(error.sentence([photo.name for photo in photos])) from None
-
-
-@contextmanager
-def _opened(settings: Settings, tenant: str) -> Iterator[_Entrance]:
-    """Open the deployment.
-
-    Only the default tenant is made where it is missing.
-    """
-    runtime = Runtime.open(settings)
-    try:
-        prepare_database(runtime.store)
-        if runtime.pack is None:
-            raise UsageError("photos need a model pack; name it with --pack")
-        tenants = runtime.store.tenants
-        known = tenants.create(tenant) if tenant == DEFAULT_TENANT else tenants.get(tenant)
-        yield _Entrance(runtime, runtime.pack, known.name)
-    finally:
-        runtime.close()

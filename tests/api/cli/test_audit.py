@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from api.cli import audit_fairface, descriptors
+from api.cli.bulk import Bulk
 from models.demo import DEMO_NOTICE
 from tests.api.cli.audit_bench import (
     TRAIN,
@@ -19,7 +19,7 @@ from tests.api.cli.audit_bench import (
     draw_fairface,
     named_in,
 )
-from tests.api.cli.conftest import Ran, World, run
+from tests.api.cli.conftest import DIM, Ran, World, run
 from tests.leaks import LeakSearch
 
 pytestmark = pytest.mark.long
@@ -55,11 +55,10 @@ def faces(world: World, tmp_path_factory: pytest.TempPathFactory) -> FaceAudit:
     asked: tuple[str | Path, ...] = (
         *("audit", "fairface", root / "fairface", "--pack", world.pack, "--aligned"),
         *("--data-dir", world.data, "--cache", root / "faces.cache", "--lifting", "100"),
-        *("--strategy", "raw,adversarial", "--dim", "2", "--generated-dim", "4"),
-        *("--service-dim", "4"),
+        *("--strategy", "adversarial", "--dim", "2", "--generated-dim", "4"),
     )
     found: list[np.ndarray] = []
-    plain = descriptors.extract
+    plain = Bulk.extract
     with pytest.MonkeyPatch.context() as patch:
 
         def recorded(*given: Any, **named: Any) -> Any:
@@ -67,7 +66,7 @@ def faces(world: World, tmp_path_factory: pytest.TempPathFactory) -> FaceAudit:
             found.append(extraction.embeddings)
             return extraction
 
-        patch.setattr(audit_fairface, "extract", recorded)
+        patch.setattr(Bulk, "extract", recorded)
         first = run(
             *asked, "--limit", "attribute-leakage=0", "--out", root / "out", "--json",
         )  # fmt: skip
@@ -130,7 +129,7 @@ def test_a_limit_that_is_exceeded_is_status_1(faces: FaceAudit, face_report: Any
     assert face_report["limits"]["attribute-leakage"] == 0
     (verdict,) = face_report["verdicts"]
     assert (verdict["strategy"], verdict["decoys"], verdict["dim"]) == (
-        *("adversarial", "generator", 4),
+        *("adversarial", "generator", DIM),
     )
     (cell,) = verdict["cells"]
     assert (cell["status"], cell["limit"], cell["property"]) == (

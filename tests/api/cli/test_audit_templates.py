@@ -6,7 +6,6 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,8 +13,7 @@ import pytest
 
 import attacks.audit
 from api.cli import audit_templates
-from api.cli.audit_report import TEMPLATE_LIMITS, served_scheme
-from api.service.opening import file_sealer, open_keyring
+from api.cli.bulk import Bulk
 from api.settings import Settings
 from attacks.audit import AuditPlan, AuditResult
 from attacks.bed import Testbed
@@ -27,15 +25,14 @@ from attacks.stored.known_pool import known_pool
 from attacks.verdict import LIMITS, Status
 from models.demo import DEMO_NOTICE
 from models.extraction import Extraction
-from templates.decoys import DecoyGenerator, load_source
-from templates.space.lifting import Strategy
+from templates.decoys import DecoyGenerator
 from tests.api.cli.audit_bench import are_pictures, both, documented, draw_people, named_in
 from tests.api.cli.conftest import DIM, Ran, World, run
 from tests.attacks.beds import bed_of
 from tests.leaks import LeakSearch
 from verify import calibrate
 
-WITHOUT_LIMITS = [f"--limit={name}=1" for name in TEMPLATE_LIMITS]
+WITHOUT_LIMITS = [f"--limit={limit.name}=1" for limit in LIMITS]
 
 
 @dataclass(frozen=True)
@@ -157,8 +154,6 @@ def test_what_two_attacks_found_becomes_report_verdict_and_status(
 
     def two_attacks(plan: AuditPlan, faces: Extraction, *_: Any, **__: Any) -> AuditResult:
         assert (plan.victims, len(faces.embeddings)) == (20, 20)
-        # Those of the contract in data_dir, where nothing else is asked for.
-        assert (plan.dims, plan.strategy) == ((DIM,), Strategy.ADVERSARIAL)
         outcomes = [*run_attack(foot_point, bed), *run_attack(known_pool, bed)]
         return AuditResult(outcomes, [], [], {"victims": plan.victims})
 
@@ -181,38 +176,27 @@ def test_what_two_attacks_found_becomes_report_verdict_and_status(
 
 
 @pytest.mark.parametrize(
-    ("given", "plan", "said"),
+    ("given", "dims", "strategy", "of_contract"),
     [
-        (["--dim", "3"], ((3,), "hybrid"), "auditing hybrid templates of m = 3"),
-        (["--strategy", "random"], ((DIM,), "random"), f"auditing random templates of m = {DIM}"),
-        ([], ((DIM,), "hybrid"), f"auditing hybrid templates of m = {DIM}"),
-        (["--dim", "3", "--strategy", "random", "--axes", "50"], ((3,), "random"), None),
+        ([], (64,), "adversarial", True),
+        (["--dim", "3,5", "--axes", "50"], (3, 5), "adversarial", False),
+        (["--strategy", "random"], (64,), "random", False),
     ],
 )
-def test_what_is_not_set_is_the_contracts(
+def test_the_contract_is_audited_unless_a_scheme_is_described(
     world: World,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     given: list[str],
-    plan: tuple[tuple[int, ...], str],
-    said: str | None,
+    dims: tuple[int, ...],
+    strategy: str,
+    of_contract: bool,
 ) -> None:
-    def served(*_: Any) -> Any:
-        return SimpleNamespace(m=DIM, strategy=Strategy.HYBRID, axes=100)
-
-    monkeypatch.setattr(audit_templates, "served_scheme", served)
-    assert planned(world, tmp_path, monkeypatch, *given) == (plan, said)
-
-
-def planned(
-    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *given: str | Path
-) -> tuple[tuple[tuple[int, ...], str], str | None]:
-    """What the command asks for, and the beginning of what it says of it."""
     plans: list[AuditPlan] = []
 
     def recorded(plan: AuditPlan, *_: Any, **__: Any) -> AuditResult:
         plans.append(plan)
-        return AuditResult(run_attack(foot_point, bed_of("pool")), [], [], {})
+        return AuditResult([], [], [], {})
 
     monkeypatch.setattr(audit_templates, "run_audit", recorded)
     ran = run(
@@ -220,22 +204,21 @@ def planned(
         *("--aligned", "--out", tmp_path / "out", *given),
     )
     (plan,) = plans
-    lines = [line.removeprefix("note: ") for line in ran.stderr.splitlines() if "auditing" in line]
-    said = lines[0].split(": ")[0] if lines else None
-    return (plan.dims, str(plan.strategy)), said
+    assert (plan.dims, str(plan.strategy)) == (dims, strategy)
+    # Nothing was judged, so nothing fails, and nothing is shown.
+    assert (ran.status, ran.stdout.partition(":")[0]) == (3, "NOT SHOWN")
+    assert (plan.contract is not None) == of_contract == ("auditing the contract" in ran.stderr)
 
 
-def test_a_contract_of_other_decoys_says_no_dimension(world: World) -> None:
-    settings = Settings(data_dir=world.data)
-    sealer = file_sealer(open_keyring(settings))
-    own = load_source(settings.resolved_decoys_file, sealer)
-    served = served_scheme(settings, sealer, own)
+def test_a_contract_of_other_decoys_is_not_served(world: World) -> None:
+    bulk = Bulk(Settings(data_dir=world.data, pack=world.pack))
+    own = bulk.decoys(None)
+    served = bulk.served_contract(own)
     assert served is not None
-    assert served.m == DIM
+    assert served.binding.m == DIM
     rows = np.random.default_rng(0).normal(size=(150, own.n))
     other = DecoyGenerator.fit(rows / np.linalg.norm(rows, axis=1, keepdims=True))
-    assert served_scheme(settings, sealer, other) is None
-    assert served_scheme(settings, sealer, None) is None
+    assert bulk.served_contract(other) is None
 
 
 @pytest.mark.long

@@ -1,7 +1,5 @@
 """What `veilface audit` refuses: one sentence that names the cause and the remedy."""
 
-import shutil
-from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -12,40 +10,28 @@ from templates.keys.randomness import Keystream
 from tests.api.cli.audit_bench import draw_fairface
 from tests.api.cli.conftest import Ran, World, run
 
-SMALL = ("--lifting", "100", "--strategy", "raw", "--generated-dim", "4", "--service-dim", "4")
-AXES = ("--axes", "50")
-FAIRFACE_USAGE: list[tuple[list[str], str]] = [
-    (["--device", "nowhere"], "; leave out --device to use the processor"),
-    (["--limit", "attribute-leakage=1.5"], "not 'attribute-leakage=1.5'"),
-    (["--limit", "attribute-leakage"], "--limit takes NAME=SHARE, a share from 0 to 1 and a name"),
-    (["--limit", "leakage=0.1"], "not 'leakage=0.1'"),
-    (["--limit", "linkability=0"], "a name of attribute-leakage, not 'linkability=0'"),
-    (
-        ["--strategy", "raw,homomorphic"],
-        "--strategy takes a list of raw, random, adversarial, hybrid",
-    ),
-    (["--dim", "two"], "--dim takes whole numbers such as 2,4, not 'two'"),
-    (["--dim", "2,256"], "--dim takes dimensions from 1 to 255, not 256"),
-    (["--dim", "0"], "--dim takes dimensions from 1 to 255, not 0"),
-    (["--generated-dim", "300"], "--generated-dim takes dimensions from 1 to 49, not 300"),
-    (["--generated-dim", "x"], "--generated-dim takes whole numbers such as 16,32, not 'x'"),
-    (["--service-dim", "50"], "--service-dim must be below the 50 numbers of what is lifted"),
+SMALL = ("--lifting", "100", "--strategy", "random", "--dim", "2", "--generated-dim", "4")
+FAIRFACE: list[tuple[list[str], str, int]] = [
+    (["--device", "nowhere"], "torch", 1),
+    (["--limit", "attribute-leakage=1.5"], "not 'attribute-leakage=1.5'", 2),
+    (["--limit", "leakage=0.1"], "--limit takes NAME=SHARE, a share from 0 to 1 and a name", 2),
+    (["--strategy", "random,homomorphic"], "--strategy takes a list of random, adversarial", 2),
+    (["--dim", "two"], "--dim takes whole numbers from 1 to 255, with commas, not 'two'", 2),
+    (["--dim", "2,256"], "--dim takes whole numbers from 1 to 255", 2),
+    (["--generated-dim", "300"], "--generated-dim takes whole numbers from 1 to 191", 2),
+    (["--lifting", "150"], "cannot be taken from 150 training faces", 1),
+    (["--lifting", "140"], "give the attacker more faces", 1),
 ]
-TEMPLATES_USAGE: list[tuple[list[str], str]] = [
-    (["--limit", "attribute-leakage=0"], "not 'attribute-leakage=0'"),
-    (["--device", "nowhere"], "; leave out --device to use the processor"),
-    (["--dim", "many"], "--dim takes whole numbers such as 16,32, not 'many'"),
-    (["--dim", "16,256", *AXES], "--dim takes dimensions from 1 to 49, not 256"),
-    (["--dim", "0", *AXES], "--dim takes dimensions from 1 to 49, not 0"),
-    (["--contract", "CONTRACT", "--dim", "16"], "leave out --strategy, --dim, --axes"),
-]
-TEMPLATES_FAILED: list[tuple[list[str], str]] = [
-    (["--decoys", "ABSENT"], "absent"),
-    (["--decoys", "OTHER"], "build the decoys with this pack and the same --flip"),
-    (["--decoys", "NARROW"], "the decoys have 32 numbers each, the pack gives 256"),
-    (["--decoys", "UNSAID"], "build the decoys with this pack and the same --flip"),
-    (["--contract", "ABSENT"], "cannot be read (No such file or directory)"),
-    (["--flip"], "build the decoys with this pack and the same --flip"),
+TEMPLATES: list[tuple[list[str], str, int]] = [
+    (["--limit", "linkability"], "not 'linkability'", 2),
+    (["--dim", "16,256", "--axes", "50"], "--dim takes whole numbers from 1 to 49", 2),
+    (["--contract", "CONTRACT", "--dim", "16"], "leave out --strategy, --dim, --axes", 2),
+    (["--decoys", "ABSENT"], "absent", 1),
+    (["--decoys", "OTHER"], "build the decoys with this pack and the same --flip", 1),
+    (["--decoys", "UNSAID"], "build the decoys with this pack and the same --flip", 1),
+    (["--contract", "ABSENT"], "cannot be read (No such file or directory)", 1),
+    (["--contract", "CONTRACT", "--decoys", "OWN"], "use the file that the contract was", 1),
+    (["--flip"], "build the decoys with this pack and the same --flip", 1),
 ]
 
 
@@ -82,47 +68,41 @@ def templates(world: World, root: Path, *more: str | Path) -> Ran:
     return run("audit", "templates", root, *given, *more)
 
 
-@pytest.mark.parametrize(("arguments", "reason"), FAIRFACE_USAGE)
+@pytest.mark.parametrize(("arguments", "reason", "status"), FAIRFACE)
 @pytest.mark.usefixtures("before_any_face")
 def test_a_wrong_audit_of_faces_is_refused_before_any_face_is_embedded(
-    world: World, fairface_root: Path, tmp_path: Path, arguments: list[str], reason: str
+    world: World,
+    fairface_root: Path,
+    tmp_path: Path,
+    arguments: list[str],
+    reason: str,
+    status: int,
 ) -> None:
-    ran = fairface(world, fairface_root, *SMALL, *AXES, *arguments, "--out", tmp_path / "out")
-    refused(ran, reason, 2)
+    ran = fairface(world, fairface_root, *SMALL, *arguments, "--out", tmp_path / "out")
+    refused(ran, reason, status)
     assert not (tmp_path / "out").exists()
 
 
-def paths(world: World, folder: Path, arguments: Sequence[str]) -> list[str | Path]:
-    files = {
-        "DECOYS": world.data / "decoys.veil",
-        "CONTRACT": world.data / "contract.json",
-        **{name: folder / name.lower() for name in ("ABSENT", "OTHER", "NARROW", "UNSAID")},
-    }
-    return [files.get(argument, argument) for argument in arguments]
-
-
-def write_decoys(world: World, folder: Path) -> None:
-    """Decoys of another model, of another dimension, and of no model that they name."""
+def write_decoys(world: World, folder: Path) -> dict[str, Path]:
+    """Decoys of another model, of no model that they name, and others of the right one."""
     known = DecoyGenerator.load(world.data / "decoys.veil")
     stream = Keystream.seeded("decoys of a test")
     drawn = known.draw(150, 1, stream=stream)[:, 0]
-    DecoyGenerator.fit(drawn, made_with="ab" * 32).save(folder / "other")
-    DecoyGenerator.fit(drawn).save(folder / "unsaid")
-    narrow = drawn[:, :32] / (drawn[:, :32] ** 2).sum(axis=1, keepdims=True) ** 0.5
-    DecoyGenerator.fit(narrow, made_with=known.made_with).save(folder / "narrow")
+    files = {name: folder / name.lower() for name in ("ABSENT", "OTHER", "UNSAID", "OWN")}
+    DecoyGenerator.fit(drawn, made_with="ab" * 32).save(files["OTHER"])
+    DecoyGenerator.fit(drawn).save(files["UNSAID"])
+    DecoyGenerator.fit(drawn, made_with=known.made_with).save(files["OWN"])
+    return {**files, "CONTRACT": world.data / "contract.json"}
 
 
-@pytest.mark.parametrize(
-    ("arguments", "reason", "status"),
-    [(*one, 2) for one in TEMPLATES_USAGE] + [(*one, 1) for one in TEMPLATES_FAILED],
-)
+@pytest.mark.parametrize(("arguments", "reason", "status"), TEMPLATES)
 @pytest.mark.usefixtures("before_any_face")
 def test_a_wrong_audit_of_templates_is_refused_before_any_face_is_embedded(
     world: World, tmp_path: Path, arguments: list[str], reason: str, status: int
 ) -> None:
-    write_decoys(world, tmp_path)
-    given = paths(world, tmp_path, arguments)
-    sizes = ("--victims", "20", "--owners", "100", "--dim", "4")
+    files = write_decoys(world, tmp_path)
+    given = [files.get(argument, argument) for argument in arguments]
+    sizes = ("--victims", "20", "--owners", "100")
     ran = templates(world, world.labelled, *sizes, *given, "--out", tmp_path / "out")
     refused(ran, reason, status)
     assert not (tmp_path / "out").exists()
@@ -155,32 +135,8 @@ def test_options_of_a_wrong_kind_are_refused(
     assert "Traceback" not in ran.stderr
 
 
-def test_a_folder_without_label_files_is_refused(
-    world: World, fairface_root: Path, tmp_path: Path
-) -> None:
-    refused(fairface(world, tmp_path, *SMALL), "has no fairface_label_train.csv; give the", 1)
-    half = tmp_path / "half"
-    half.mkdir()
-    (half / "train").symlink_to(fairface_root / "train")
-    shutil.copy(fairface_root / "fairface_label_train.csv", half)
-    refused(fairface(world, half, *SMALL), "has no fairface_label_val.csv; give the", 1)
-
-
-@pytest.mark.parametrize(
-    ("sizes", "reason"),
-    [
-        (["--lifting", "150"], "cannot be taken from 150 training faces"),
-        ([], "give the attacker more faces"),
-    ],
-)
-@pytest.mark.usefixtures("before_any_face")
-def test_sizes_that_do_not_fit_are_refused(
-    world: World, fairface_root: Path, tmp_path: Path, sizes: list[str], reason: str
-) -> None:
-    asked = ("--strategy", "raw", "--generated-dim", "4", "--service-dim", "4", *sizes)
-    ran = fairface(world, fairface_root, *asked, "--out", tmp_path / "out")
-    refused(ran, reason, 1)
-    assert not (tmp_path / "out").exists()
+def test_a_folder_without_label_files_is_refused(world: World, tmp_path: Path) -> None:
+    refused(fairface(world, tmp_path, *SMALL), "fairface_label_train.csv is not there", 1)
 
 
 def test_too_few_people_are_refused(world: World, tmp_path: Path) -> None:
@@ -208,14 +164,3 @@ def test_a_folder_that_is_too_small_is_refused(world: World, tmp_path: Path) -> 
         "180 people are left to calibrate on, and 200 are the least",
         1,
     )
-
-
-@pytest.mark.usefixtures("before_any_face")
-def test_a_contract_of_other_decoys_is_refused(world: World, tmp_path: Path) -> None:
-    known = DecoyGenerator.load(world.data / "decoys.veil")
-    stream = Keystream.seeded("other decoys of a test")
-    drawn = known.draw(150, 1, stream=stream)[:, 0]
-    DecoyGenerator.fit(drawn, made_with=known.made_with).save(tmp_path / "other")
-    contract = ("--contract", world.data / "contract.json")
-    ran = templates(world, world.labelled, *contract, "--decoys", tmp_path / "other")
-    refused(ran, "use the file that the contract was calibrated with", 1)

@@ -43,8 +43,10 @@ def test_the_demo_model_is_named_and_the_cohort_is_not_shown(world):
     privacy = world.calibrated["contract"]["verdict"]["privacy"]
     assert (privacy["status"], privacy["basis"]["victims"]) == ("NOT SHOWN", 25)
     assert (world.calibrated["chosen"], world.calibrated["tried"]) == ("asked for", [])
-    told = world.calibrated["photo_consistency"]
-    assert told["threshold"] == world.calibrated["contract"]["photo_consistency"]
+    assert (
+        world.calibrated["consistency"]["threshold"]
+        == world.calibrated["contract"]["photo_consistency"]
+    )
 
 
 def test_people_are_left_out_and_ten_fold_adds_a_level(world, veilface, data, tmp_path):
@@ -53,7 +55,7 @@ def test_people_are_left_out_and_ten_fold_adds_a_level(world, veilface, data, tm
     ran = veilface(
         *("calibrate", world.labelled, "--pack", world.pack, "--axes", "32", "--dim", "4"),
         *("--exclude-people", listing, "--protocol", "ten-fold", "--strategy", "hybrid"),
-        *("--out", tmp_path / "contract.json", "--photos", "2"),
+        *("--out", tmp_path / "contract.json"),
     )
     assert ran.status == 0, ran.stderr
     assert "accuracy" in ran.stdout
@@ -151,7 +153,7 @@ def test_a_failed_verdict_says_what_would_help(world, data):
     privacy, accuracy, last = verdict_lines(uneven)
     assert last.startswith("Groups: FAIL. Worst is race x: 20 % (80")
     assert accuracy.endswith(" Not counted: 7 of 2,000 photos without a usable face.")
-    assert "about 1 person in 5 could be recognised elsewhere (80 of 400)" in privacy
+    assert "about 1 in 5 people could be recognised elsewhere (80 of 400)" in privacy
 
 
 def test_labels_give_rates_by_group_and_thresholds_that_hold_in_each(
@@ -205,7 +207,7 @@ def test_random_lifting_is_for_experiments_only(world, veilface, tmp_path):
     ("text", "dims"),
     [
         *(("none", ()), ("2,4, 8", (2, 4, 8)), ("16", (16,))),
-        *((wrong, None) for wrong in ("", "0", "2;4", "a", "-1", "129", "none,2")),
+        *((wrong, None) for wrong in ("", "0", "2;4", "a", "-1", "193", "none,2")),
     ],
 )
 def test_probe_dimensions_are_read(text, dims):

@@ -25,7 +25,7 @@ def test_upgrade_and_check(tmp_path):
         "before": None,
         "after": head_revision(),
     }
-    assert "up to date" in run("db", "upgrade", *where).stdout
+    assert run("db", "upgrade", *where).stdout.count(head_revision()) == 2
     assert run("db", "compact", *where, "--json").json == {"compacted": True}
     checked = run("db", "check", *where, "--json")
     assert (checked.status, checked.json["current"]) == (0, head_revision())
@@ -42,8 +42,8 @@ def test_enrollment_by_template_is_off_until_it_is_allowed(tmp_path):
     acme = ("db", "template-enrollment", *where, "--tenant", "acme")
     assert run(*acme, "--json").json == {"tenant": "acme", "template_enrollment": False}
     assert run(*acme, "--allow", "--json").json == {"tenant": "acme", "template_enrollment": True}
-    assert "takes templates" in run(*acme).stdout
-    assert "does not take templates" in run(*acme, "--forbid").stdout
+    assert "template enrollment: yes" in run(*acme).stdout
+    assert "template enrollment: no" in run(*acme, "--forbid").stdout
     assert run(*acme, "--json").json["template_enrollment"] is False
     log = [json.loads(line) for line in run("audit-log", "show", *where).stdout.splitlines()]
     outcomes = [line["outcome"] for line in log if line["action"] == "tenant-settings"]
@@ -142,13 +142,13 @@ def test_a_tenant_is_erased_with_a_receipt(opened, tmp_path):
     receipt = tmp_path / "receipt.json"
     ran = run("db", "erase-tenant", "acme", "--confirm", "acme", "--out", receipt, *where)
     assert ran.status == 0, ran.stderr
-    assert "2 subjects" in ran.stdout
+    assert "acme" in ran.stdout
     assert store.api_keys.verify(token) is None
     assert "acme" not in [tenant.name for tenant in store.tenants.all()]
     assert store.subjects.describe("default", "a") is not None
     key = base64.b64encode(store.signer.public_key()).decode()
     checked = run("keys", "verify-receipt", receipt, "--public-key", key)
     assert checked.status == 0, checked.stderr
-    assert "acme was erased" in checked.stdout
+    assert "claims tenant: acme" in checked.stdout
     missing = run("db", "erase-tenant", "nobody", "--confirm", "nobody", *where)
     assert missing.status == 1

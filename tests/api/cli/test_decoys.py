@@ -19,9 +19,8 @@ def test_a_generator_is_made(world):
     assert world.built["failure_to_acquire"] == {"photos": 150, "failed": 0, "reasons": {}}
     source = DecoyGenerator.load(world.data / "decoys.veil")
     assert source.source_id == world.built["source_id"]
-    assert source.n == 256
     binding = Binding.from_json(world.calibrated["contract"]["binding"])
-    assert source.made_with == binding.embedding_id == world.built["made_with"]
+    assert source.made_with == binding.embedding_id
 
 
 @pytest.mark.parametrize(("kind", "noted"), [("generator", True), ("pool", False)])
@@ -67,7 +66,6 @@ def test_a_pool_is_sealed_and_keeps_the_labels(world, veilface, data, labelled_s
     assert isinstance(pool, DecoyPool)
     assert pool.labelled
     assert pool.source_id == ran.json["source_id"]
-    assert pool.made_with == world.built["made_with"]
 
 
 def test_people_and_photos_are_left_out(world, veilface, labelled_source, tmp_path):
@@ -100,7 +98,6 @@ def test_a_generator_is_adapted_to_a_sample(world, veilface, volunteers, tmp_pat
     assert (ran.json["descriptors"], ran.json["like"]) == (350, 100)
     adapted = DecoyGenerator.load(out)
     assert adapted.source_id == ran.json["source_id"]
-    assert adapted.made_with == world.built["made_with"]
 
 
 def test_what_cannot_be_made_is_refused(world, data, labelled_source, volunteers, tmp_path):

@@ -66,23 +66,3 @@ def test_no_command_shows_the_help_and_is_wrong_usage():
 @pytest.mark.parametrize("arguments", [["unknown"], ["verify"], ["serve", "--port", "x"]])
 def test_wrong_usage_is_status_2(arguments):
     assert run(*arguments).status == 2
-
-
-@pytest.mark.parametrize(
-    ("path", "arguments", "option"),
-    [
-        (("evaluate",), ["lfw.bin"], "repeats"),
-        (("audit", "fairface"), ["fairface"], "attacked"),
-        (("audit", "templates"), ["people"], "victims"),
-    ],
-)
-def test_quick_is_what_the_page_says_where_nothing_else_is_given(path, arguments, option):
-    command = ALL[path]
-    shown = next(each.help for each in command.params if "--quick" in each.opts)
-    flags = shown.split("`")[1]
-    quick = command.make_context("it", [*arguments, "--quick"]).params
-    written = command.make_context("it", [*arguments, *flags.split()]).params
-    assert {**quick, "_quick": False} == written
-    chosen = command.make_context("it", [*arguments, "--quick", f"--{option}", "150"]).params
-    assert chosen == {**quick, option: 150}
-    assert command.make_context("it", arguments).params != written

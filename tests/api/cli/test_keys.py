@@ -60,9 +60,6 @@ def test_a_lowest_level_is_shown_and_kept(veilface, store):
         made.json["prefix"]: "fmr-1e-4",
         free.json["prefix"]: None,
     }
-    shown = veilface("keys", "list").stdout
-    assert "fmr-1e-4" in shown
-    assert "any" in shown
     assert veilface("keys", "create", "--right", "verify", "--lowest-level", "?").status == 1
 
 
@@ -149,7 +146,8 @@ def test_a_receipt_is_verified_and_a_changed_one_is_not(store, tmp_path):
         assert ran.status == 0, ran.stderr
         assert ran.json["claims"]["held"] is False
         assert ran.json["claims"]["subject"] == store.signer.pseudonym("default", "ann")
-    assert "Valid" in run("keys", "verify-receipt", receipt, "--public-key", key).stdout
+    shown = run("keys", "verify-receipt", receipt, "--public-key", key).stdout
+    assert shown.startswith("valid: yes\nclaims ")
 
     changed = json.loads(receipt.read_text())
     changed["receipt"]["body"] = changed["receipt"]["body"].replace("false", "true")

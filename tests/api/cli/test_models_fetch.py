@@ -1,4 +1,4 @@
-"""`veilface models fetch`: from an address that the user names to a pack that can be used."""
+"""`veilface models`: from an address that the user names to a pack that can be used."""
 
 import contextlib
 import hashlib
@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 from api.cli.pack_download import shown
-from models.demo import build_demo_pack
+from models.demo import DEMO_NOTICE, build_demo_pack, demo_model_sha256
 from models.known_packs import KNOWN_PACKS
-from tests.api.cli.conftest import Ran, run
+from tests.api.cli.conftest import Ran, World, run
 from tests.ports import free_port
 
 
@@ -207,3 +207,23 @@ def test_plain_http_is_for_this_machine_or_a_pin(
 def test_secrets_of_an_address_are_not_shown() -> None:
     assert shown("https://me:secret@example.org/a.zip?key=1#x") == "https://example.org/a.zip"
     assert fetch("../up", "--from", "x").status == 2
+
+
+def test_the_demo_pack_is_usable_and_says_what_it_is(world: World) -> None:
+    ran = run("models", "inspect", world.pack)
+    assert ran.status == 0
+    assert "embedder" in ran.stdout
+    assert DEMO_NOTICE in ran.stderr
+    told = run("models", "inspect", world.pack, "--json").json
+    assert told["usable"]
+    assert told["graphs"][0]["sha256"] == demo_model_sha256()
+    assert (told["pack"]["n"], told["pack"]["detector"]) == (256, None)
+
+
+def test_a_pack_without_an_embedder_is_status_1(mbf_pack_dir: Path, tmp_path: Path) -> None:
+    detector = next(path for path in mbf_pack_dir.glob("*.onnx") if "det" in path.name)
+    (tmp_path / detector.name).symlink_to(detector)
+    ran = run("models", "inspect", tmp_path, "--json")
+    assert (ran.status, ran.json["usable"]) == (1, False)
+    assert "no embedder" in ran.json["reason"]
+    assert ran.json["graphs"][0]["role"].startswith("scrfd")

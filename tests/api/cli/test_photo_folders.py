@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 
 from api.cli.errors import CommandError
-from api.cli.photo_folders import find_photos, labelled_people
+from api.cli.files import read_names
+from api.cli.photo_folders import find_photos, labelled_people, photos_of
 
 
 def fill(folder: Path, files: dict[str, bytes]) -> Path:
@@ -44,3 +45,16 @@ def test_copies_of_one_persons_photo_count_once(
     told = capsys.readouterr().err
     assert "do not count: 4" in told
     assert "Bob/3.tif (1 in all;" in told
+
+
+def test_people_and_photos_are_left_out_by_a_list_or_a_folder(tmp_path: Path) -> None:
+    files = {f"Bob/{i}.jpg": bytes([i]) for i in range(2)} | {"Ann/9.jpg": b"9", "Cid/9.jpg": b"0"}
+    fill(tmp_path / "faces", files)
+    listing = tmp_path / "names.txt"
+    listing.write_text("# people of the test\nBob\n\n Ann/9.jpg \n9.jpg\nCi\n")
+    (photo,), left_out = photos_of([tmp_path / "faces"], read_names(listing))
+    assert (photo.parent.name, left_out) == ("Cid", 3)
+    (tmp_path / "people" / "Bob").mkdir(parents=True)
+    labelled = labelled_people(tmp_path / "faces").without(read_names(tmp_path / "people"))
+    assert labelled.identities == ("Ann", "Cid")
+    assert read_names(None) == frozenset()
