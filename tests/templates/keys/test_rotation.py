@@ -1,5 +1,6 @@
 import hashlib
 import hmac
+import itertools
 from collections.abc import Callable
 
 import numpy as np
@@ -43,11 +44,16 @@ def rotations(count: int, n: int) -> Callable[[str], Rotation]:
     return TenantRotation(count.to_bytes(32), n).of
 
 
+@pytest.mark.parametrize("whose", ["template", "holder"])
 @pytest.mark.parametrize("n", [1, 2, 3, 24, 31, 64])
-def test_rotation_follows_from_key_and_id_as_documented(n: int) -> None:
-    key, template_id = b"k" * 32, "0123456789abcdef" * 2
+def test_a_rotation_follows_from_key_and_id_or_salt_as_documented(n: int, whose: str) -> None:
+    key, salt = bytes(range(32)), "0123456789abcdef" * 2
     count = (TRANSFORMS + 1) * n
-    info = encode_parts("template rotation", "signs-hartley-1", n, template_id)
+    info = encode_parts(f"{whose} rotation", "signs-hartley-1", n, salt)
+    if whose == "template":
+        made = TenantRotation(key, n).of(salt)
+    else:
+        made = holder_rotation(bytearray(key), salt, n)
     derived = expanded(key, info, -(-count // 8))
     bits = [byte >> (7 - place) & 1 for byte in derived for place in range(8)][:count]
     signs = np.where(np.reshape(bits, (-1, n)), -1.0, 1.0)
@@ -57,8 +63,7 @@ def test_rotation_follows_from_key_and_id_as_documented(n: int) -> None:
     expected = np.diag(signs[0])
     for each in signs[1:]:
         expected = np.diag(each) @ hartley @ expected
-    found = matrix(TenantRotation(key, n).of(template_id), n)
-    np.testing.assert_allclose(found, expected, atol=1e-12)
+    np.testing.assert_allclose(matrix(made, n), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("n", [2, 7, 64, 127, 512])
@@ -72,26 +77,24 @@ def test_rotations_are_orthogonal_and_undone(n: int) -> None:
     np.testing.assert_allclose(rotation.turned(points), points @ found.T, atol=1e-12)
     np.testing.assert_array_equal(points, kept)
     np.testing.assert_allclose(rotation.turned_back(rotation.turned(points)), points, atol=1e-12)
-    again = TenantRotation(b"a" * 32, n).of("template")
-    np.testing.assert_allclose(matrix(again, n), found, atol=1e-12)
 
 
-def test_another_key_id_or_dimension_gives_an_unrelated_rotation() -> None:
+def test_another_key_id_salt_or_holder_gives_an_unrelated_rotation() -> None:
     """tr(AᵀB) of independent rotations has mean 0 and variance near 1, whatever n."""
-    n = 128
-    base = TenantRotation(b"a" * 32, n)
-    one = matrix(base.of("template"), n)
-    others = [
-        base.of("template2"),
-        base.of(""),
+    n, key = 128, b"a" * 32
+    made = [
+        TenantRotation(key, n).of("template"),
+        TenantRotation(key, n).of("template2"),
         TenantRotation(b"b" * 32, n).of("template"),
         TenantRotation(b"a" * 31 + b"b", n).of("template"),
+        holder_rotation(key, "template", n),
+        holder_rotation(key, "template2", n),
+        holder_rotation(b"b" * 32, "template", n),
     ]
-    for other in others:
-        assert abs(np.vdot(one, matrix(other, n))) < 8
-    wide = TenantRotation(b"a" * 32, 2 * n).of("template")
-    assert isinstance(wide, type(base.of("template")))
-    assert (wide.signs[0, :n] != base.of("template").signs[0]).any()
+    for one, other in itertools.combinations([matrix(rotation, n) for rotation in made], 2):
+        assert abs(np.vdot(one, other)) < 8
+    wide = TenantRotation(key, 2 * n).of("template")
+    assert (wide.signs[0, :n] != made[0].signs[0]).any()
 
 
 @pytest.mark.parametrize("n", [64, 97, 512])
@@ -153,39 +156,12 @@ def test_turning_before_lifting_is_turning_after() -> None:
 
 
 def test_key_and_dimension_are_checked_and_the_key_is_not_shown() -> None:
-    with pytest.raises(ValueError, match="32 bytes, not 31"):
-        TenantRotation(bytes(31), 8)
+    for length in (0, 31, 33):
+        with pytest.raises(ValueError, match=f"32 bytes, not {length}"):
+            TenantRotation(bytes(length), 8)
+        with pytest.raises(ValueError, match=f"32 bytes, not {length}"):
+            holder_rotation(bytes(length), "salt", 8)
     with pytest.raises(ValueError, match="dimension"):
         TenantRotation(bytes(32), 0)
     tenant = TenantRotation(b"secret" * 5 + b"xy", 8)
     assert repr(tenant) == "TenantRotation(n=8)"
-
-
-@pytest.mark.parametrize("n", [2, 31, 64])
-def test_a_holders_rotation_follows_from_key_and_salt_as_documented(n: int) -> None:
-    """That of a tenant's key and a template's id, but for the words in front."""
-    key, salt = bytes(range(32)), "fedcba9876543210" * 2
-    count = (TRANSFORMS + 1) * n
-    info = encode_parts("holder rotation", "signs-hartley-1", n, salt)
-    derived = expanded(key, info, -(-count // 8))
-    bits = np.unpackbits(np.frombuffer(derived, dtype=np.uint8), count=count)
-    expected = Rotation(1.0 - 2.0 * bits.reshape(-1, n))
-    found = matrix(holder_rotation(bytearray(key), salt, n), n)
-    np.testing.assert_array_equal(found, matrix(expected, n))
-    np.testing.assert_allclose(found @ found.T, np.eye(n), atol=1e-12)
-
-
-def test_a_holders_rotation_is_its_own() -> None:
-    """Of one key: not the tenant's, and another one for another salt."""
-    n, key = 128, b"k" * 32
-    one = matrix(holder_rotation(key, "salt", n), n)
-    others = [
-        holder_rotation(key, "salt2", n),
-        holder_rotation(b"j" * 32, "salt", n),
-        TenantRotation(key, n).of("salt"),
-    ]
-    for other in others:
-        assert abs(np.vdot(one, matrix(other, n))) < 8
-    for length in (0, 31, 33):
-        with pytest.raises(ValueError, match="32 bytes"):
-            holder_rotation(bytes(length), "salt", n)

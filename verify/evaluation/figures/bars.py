@@ -135,7 +135,7 @@ def _raw_line(axes: Axes, raw: Row | None) -> None:
 def _floor(rows: Sequence[Row]) -> float:
     """Return where the vertical axis starts: a twentieth of its height below the lowest foot."""
     foot = min(100 * (r["accuracy_mean"] - r["accuracy_std"]) for r in rows if r["accuracy_mean"])
-    return max(0.0, float(np.floor(foot - (100 - foot) / 20)))
+    return float(np.clip(np.floor(foot - (100 - foot) / 20), 0, 99))
 
 
 def _dress(axes: Axes, places: Mapping[tuple[str, int], float], floor: float, title: str) -> None:
