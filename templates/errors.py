@@ -15,7 +15,6 @@
     ├── StoreError
     │   ├── StoreUnavailable     the database does not answer
     │   │   └── StoreBusy        it answers, but this request not now
-    │   │       └── Superseded   a decision on a template that was replaced or erased [12]
     │   ├── InvalidIdentifier    a subject id, tenant name or cursor that breaks the rules [1]
     │   ├── UnknownTenant        no tenant of this name [1]
     │   │   └── RetiredRotation  no rotation key of this epoch any more [11]
@@ -38,7 +37,7 @@ Each is defined here, or next to what raises it: [1] ``templates.store.identifie
 [5] ``verify.evaluation.plan``, [6] ``verify.evaluation.cluster``, [7] ``attacks.outcomes``,
 [8] ``api.http.errors``, [9] ``verify.preparation``, [10] ``api.cli.errors``,
 [11] ``templates.store.tenants``, [12] ``templates.store.lockout``,
-[13] ``templates.store.audit_log``, [17] ``templates.store.subjects``.
+[13] ``templates.store.audit_chain``, [17] ``templates.store.subjects``.
 
 Messages name the cause and the remedy. They never hold a number of a descriptor, a template or
 an image, nor a key.

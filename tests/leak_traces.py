@@ -455,7 +455,7 @@ def _open_the_store(traces: ServiceTraces) -> None:
         traces.database_url, MasterKeyring.load(traces.folder / "data" / "master.key")
     )
     try:
-        key = store.tenants.rotation_key("default").key
+        key = store.tenants.rotation_key("default", 1)
         rotation = TenantRotation(key, traces.material.pool.shape[1])
         for subject in traces.subjects:
             opened = store.subjects.get("default", subject)

@@ -143,5 +143,5 @@ def test_a_database_is_restored_as_the_page_says(drill: Drill, tmp_path: Path) -
     assert told.status == 1
     assert TOLD in told.stderr
     assert f"`{TOLD}`" in PAGE
-    assert store.erasures.erase("default", "ann").receipt.held
+    assert store.erasures.erase("default", "ann").receipt.claims["held"]
     store.close()

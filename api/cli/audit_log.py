@@ -17,6 +17,7 @@ from api.http.audit import operator
 from api.http.schemas import iso_time
 from api.service.opening import checked_store
 from api.settings import DEFAULT_TENANT, Settings
+from templates.store import archive_audit_log, verify_audit_log
 from templates.store.audit_archive import Archive, verify_archive
 from templates.store.audit_chain import Anchor
 from templates.store.audit_log import Line
@@ -59,7 +60,7 @@ def verify(
         checked_store(settings) as store,
         progress("verifying the audit log", None) as advance,
     ):
-        report = store.verify_audit_log(anchor=kept, progress=advance)
+        report = verify_audit_log(store, anchor=kept, progress=advance)
     problem, records = report.problem, report.records
     what = "records of the database were" if problem is None else "the audit log was"
     return Result(
@@ -93,7 +94,7 @@ def archive(
     Example: `veilface audit-log archive audit-2026.jsonl`
     """
     with checked_store(settings) as store:
-        return _archived(store.archive_audit_log(file, through=through, by=operator()))
+        return _archived(archive_audit_log(store, file, through=through, by=operator()))
 
 
 @app.command("verify-archive")

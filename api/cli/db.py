@@ -120,9 +120,9 @@ def purge(
     """
     retention = retention_of(settings)
     with checked_store(settings) as store:
-        due, erased, log_purged = store.retention.due(retention), 0, True
+        due, erased, log_purged = store.erasures.expired(retention), 0, True
         if not dry_run:
-            erased = store.retention.erase_expired(retention)
+            erased = store.erasures.erase_expired(retention)
             log_purged = store.purge()
     return Result({"due": due, "erased": erased, "log_purged": log_purged})
 

@@ -217,6 +217,6 @@ def _described(key: ApiKey) -> dict[str, Any]:
     else:
         state = "valid" if key.is_valid_at(utc_now()) else "expired"
     names = ("prefix", "tenant", "lowest_level", "label")
-    times = ("created_at", "expires_at", "revoked_at", "last_used_at")
+    times = ("created_at", "expires_at", "revoked_at")
     facts = {name: getattr(key, name) for name in (*names, *times)}
     return {**facts, "rights": sorted(key.rights), "state": state}

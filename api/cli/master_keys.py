@@ -16,7 +16,7 @@ from api.settings import Settings
 from templates.contract.document import Contract
 from templates.decoys import DecoyPool, load_source
 from templates.keys.sealing import MasterKeyring
-from templates.store import TemplateStore
+from templates.store import TemplateStore, count_wrapped, renew_secrets, rewrap_keys
 from templates.store.identifiers import utc_now
 
 Retire = Annotated[
@@ -91,7 +91,7 @@ def renew(
         if in_file:
             add_key(settings, store)
         done = rewrap_all(settings, store)
-        renewed = store.renew_secrets(archive, by=operator())
+        renewed = renew_secrets(store, archive, by=operator())
         if in_file:
             done["retired"] = retire_older(settings, store)
         enroll_again = {}
@@ -143,9 +143,9 @@ def add_key(settings: Settings, store: TemplateStore) -> None:
 def rewrap_all(settings: Settings, store: TemplateStore) -> dict[str, Any]:
     """Bring the database, and the files that are sealed, under the current master key."""
     keyring = open_keyring(settings)
-    total = sum(n for key, n in store.wrapped_keys.count().items() if key != keyring.current)
+    total = sum(n for key, n in count_wrapped(store).items() if key != keyring.current)
     with progress("wrapping keys again", total) as advance:
-        changed = store.wrapped_keys.rewrap(progress=advance)
+        changed = rewrap_keys(store, progress=advance)
     return {
         "key_id": keyring.current,
         "rewrapped": changed,
@@ -157,7 +157,7 @@ def rewrap_all(settings: Settings, store: TemplateStore) -> dict[str, Any]:
 def retire_older(settings: Settings, store: TemplateStore) -> int:
     """Drop the older keys from the key file; return how many."""
     path, current = settings.resolved_master_key_file, open_keyring(settings).current
-    if set(store.wrapped_keys.count()) - {current}:
+    if set(count_wrapped(store)) - {current}:
         raise CommandError(
             "something is still wrapped by an older master key; run `veilface keys rewrap` "
             "again before retiring it"

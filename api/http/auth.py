@@ -163,7 +163,6 @@ def _recognised(runtime: Runtime, text: str) -> tuple[ApiKey | None, SubjectToke
     token = None if key is None else opened_token(runtime.keyring, text, key_id=key.id)
     if key is None or token is None:
         return None, None
-    keys.note_use(key)
     return key, token
 
 

@@ -31,7 +31,7 @@ async def purge_regularly(
 
     def purge() -> None:
         # Before the rest: it is emptied from the log of the same round.
-        erased = store.retention.erase_expired(keep)
+        erased = store.erasures.erase_expired(keep)
         if erased:
             log("retention erased subjects", subjects=erased)
         if not store.purge():

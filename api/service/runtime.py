@@ -21,7 +21,6 @@ from api.service.served_graphs import served_graphs
 from api.service.stand_in import SealedStandIn
 from api.settings import Settings
 from enroll import Enroller, Enrollment
-from enroll.enroller import WIRE_DTYPE
 from models.pack import ModelPack
 from templates.contract import wire
 from templates.contract.document import Contract
@@ -90,7 +89,7 @@ class Runtime(Deployment):
         return template, self.epoch(tenant, template.record.rotation_epoch)
 
     def _epoch(self, tenant: str, number: int) -> Epoch:
-        key = self.store.tenants.rotation_key(tenant, epoch=number).key
+        key = self.store.tenants.rotation_key(tenant, number)
         rotation = TenantRotation(key, self.contract.binding.axes)
         lift_secret = self.store.secrets.get(SecretName.LIFTS)
         return Epoch(
@@ -142,15 +141,11 @@ class Runtime(Deployment):
 
         `precondition`, `token` and `action` are those of ``Subjects.put``.
         """
-        binding = self.contract.binding
         return self.store.subjects.put(
             tenant,
             subject,
             enrollment.wire,
             contract_id=enrollment.contract_id,
-            n=binding.axes,
-            m=binding.m,
-            dtype=WIRE_DTYPE,
             source=source,
             photos=photos,
             template_id=enrollment.template_id,

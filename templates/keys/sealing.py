@@ -141,7 +141,7 @@ class MasterKeyring:
         """Keep only the first key of a key file; returns how many were dropped.
 
         Whatever is still sealed under a dropped key is lost: ask
-        ``TemplateStore.wrapped_keys.count()`` first. `keep` is the id of the key that everything
+        ``templates.store.count_wrapped`` first. `keep` is the id of the key that everything
         was found to be sealed under; where another one is the first by now, or the file cannot be
         replaced, a :class:`SealError` says so and no key is dropped.
         """

@@ -8,15 +8,14 @@ make a key nor widen one. A row whose MAC is wrong is refused.
 """
 
 import contextlib
-import functools
 import hashlib
 import hmac
 import logging
 import os
 import uuid
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from enum import StrEnum
 from typing import Any
 
@@ -36,8 +35,6 @@ from templates.store.tenants import tenant_of
 MAX_LABEL = 128
 
 _NOBODYS_HASH = os.urandom(32)
-_USE_IS_NOTED_EVERY = timedelta(minutes=1)
-_NOTE_WAIT_S = 0.1
 _logger = logging.getLogger("veilface.store")
 
 
@@ -66,7 +63,6 @@ class ApiKey:
     created_at: datetime
     expires_at: datetime | None = None
     revoked_at: datetime | None = None
-    last_used_at: datetime | None = None
     lowest_level: str | None = None
     authentic: bool = True
 
@@ -109,18 +105,25 @@ class ApiKeys:
             raise StoreError(f"a label has at most {MAX_LABEL} printable characters")
         if lowest_level is not None and not LEVEL_NAME.fullmatch(lowest_level):
             raise StoreError("the lowest level of a key is the name of a level, such as fmr-1e-4")
-        key = ApiKey(
-            id=uuid.uuid4().hex,
-            prefix=os.urandom(6).hex(),
-            tenant=tenant,
-            rights=granted,
-            label=label,
-            created_at=self._context.clock(),
-            expires_at=expires_at,
-            lowest_level=lowest_level,
-        )
+        prefix = os.urandom(6).hex()
+        token = f"vf_{prefix}_{os.urandom(32).hex()}"
         with self._context.database.write() as session:
-            return self._insert(session, key, by)
+            row = ApiKeyRow(
+                id=uuid.uuid4().hex,
+                tenant_id=tenant_of(session, tenant).id,
+                prefix=prefix,
+                token_hash=_token_hash(token),
+                rights=",".join(sorted(granted)),
+                label=label,
+                created_at=self._context.clock(),
+                expires_at=expires_at,
+                lowest_level=lowest_level,
+            )
+            row.mac = _mac(self._secret, row, tenant)
+            session.add(row)
+            entry = Entry("key-create", "created", by, tenant, detail=prefix)
+            self._context.audit_log.append(session, entry)
+            return NewApiKey(self._read(row, tenant), token)
 
     def verify(self, token: str) -> ApiKey | None:
         """Return the key of a token, or None if it is unknown, wrong, expired or revoked.
@@ -129,21 +132,17 @@ class ApiKeys:
         compared too.
         """
         match = TOKEN.fullmatch(token)
-        row = self._row(match[1] if match else "")
+        row, tenant = self._row(match[1] if match else "")
         expected = _NOBODYS_HASH if row is None else row.token_hash
         same = hmac.compare_digest(_token_hash(token), expected)
-        key = self._valid(row) if same else None
-        if key is not None:
-            self.note_use(key)
-        return key
+        return self._valid(row, tenant) if same else None
 
     def valid(self, prefix: str) -> ApiKey | None:
         """Return the key of a prefix if it is good now.
 
-        For what the service itself made under that key: a caller who knows a prefix has no key. So
-        the use is not noted: see :meth:`note_use`.
+        For what the service itself made under that key: a caller who knows a prefix has no key.
         """
-        return self._valid(self._row(prefix))
+        return self._valid(*self._row(prefix))
 
     def all(self, *, tenant: str | None = None) -> tuple[ApiKey, ...]:
         """Every key, or every key of a tenant, the oldest first."""
@@ -157,7 +156,7 @@ class ApiKeys:
         """Every key that a query finds, by default every one."""
         with _unreadable_is_altered():
             rows = session.execute(_KEYS if query is None else query).all()
-        return tuple(self._read(row) for row in rows)
+        return tuple(self._read(row, tenant) for row, tenant in rows)
 
     def revoke(self, prefix: str, *, by: By = PROGRAM) -> bool:
         """Revoke a key for good; True unless it was unknown or revoked before.
@@ -165,14 +164,17 @@ class ApiKeys:
         An unknown prefix does not get into the audit log: it may be a token that was taken for one.
         """
         with self._context.database.write() as session:
-            row = session.execute(_OF_PREFIX, {"prefix": prefix}).one_or_none()
+            row, tenant = session.execute(_OF_PREFIX, {"prefix": prefix}).one_or_none() or NOBODY
             if row is None:
                 entry = Entry("key-revoke", "unknown_key", by)
             elif row.revoked_at is not None:
-                entry = Entry("key-revoke", "revoked_before", by, row.tenant, detail=prefix)
+                entry = Entry("key-revoke", "revoked_before", by, tenant, detail=prefix)
             else:
-                entry = Entry("key-revoke", "revoked", by, row.tenant, detail=prefix)
-                self._revoke(session, row)
+                entry = Entry("key-revoke", "revoked", by, tenant, detail=prefix)
+                is_authentic = self._is_authentic(row, tenant)
+                row.revoked_at = self._context.clock()
+                if is_authentic:
+                    row.mac = _mac(self._secret, row, tenant)
             self._context.audit_log.append(session, entry)
         return entry.outcome == "revoked"
 
@@ -182,33 +184,26 @@ class ApiKeys:
         Returns the prefixes of the others, which are good for nothing from then on.
         """
         refused = []
-        for row in session.execute(_KEYS).all():
-            if self._is_authentic(row):
-                _update(session, row.id, mac=_mac(secret, row._asdict()))
+        for row, tenant in session.execute(_KEYS).all():
+            if self._is_authentic(row, tenant):
+                row.mac = _mac(secret, row, tenant)
             else:
                 refused.append(row.prefix)
         return tuple(refused)
 
-    def note_use(self, key: ApiKey) -> None:
-        """Note that a key is used: to the minute, so that not every request is a write.
-
-        A failure is passed over: a full, busy or read-only database must not refuse a good key.
-        """
-        now = self._context.clock()
-        if key.last_used_at is not None and key.last_used_at > now - _USE_IS_NOTED_EVERY:
-            return
-        database = self._context.database
-        with contextlib.suppress(StoreError), database.write(wait=_NOTE_WAIT_S) as session:
-            _update(session, key.id, last_used_at=now)
+    @property
+    def _secret(self) -> bytes:
+        return self._context.secrets.get(SecretName.API_KEYS)
 
     def _row(self, prefix: str) -> Any:
+        """The row of a prefix and the name of its tenant, or nobody's."""
         with _unreadable_is_altered(), self._context.database.read() as session:
-            return session.execute(_OF_PREFIX, {"prefix": prefix}).one_or_none()
+            return session.execute(_OF_PREFIX, {"prefix": prefix}).one_or_none() or NOBODY
 
-    def _valid(self, row: Any) -> ApiKey | None:
+    def _valid(self, row: ApiKeyRow | None, tenant: str) -> ApiKey | None:
         if row is None:
             return None
-        key = self._read(row)
+        key = self._read(row, tenant)
         if not key.authentic:
             _logger.warning(
                 "an API key's row is not authentic and was passed over",
@@ -216,57 +211,27 @@ class ApiKeys:
             )
         return key if key.is_valid_at(self._context.clock()) else None
 
-    def _read(self, row: Any) -> ApiKey:
+    def _read(self, row: ApiKeyRow, tenant: str) -> ApiKey:
         with _unreadable_is_altered():
-            values = {name: row._mapping[name] for name in _FIELDS}
-            values["rights"] = _granted(row.rights)
-            return ApiKey(**values, authentic=self._is_authentic(row))
+            return ApiKey(
+                id=row.id,
+                prefix=row.prefix,
+                tenant=tenant,
+                rights=frozenset(right for right in Right if right in row.rights.split(",")),
+                label=row.label,
+                created_at=row.created_at,
+                expires_at=row.expires_at,
+                revoked_at=row.revoked_at,
+                lowest_level=row.lowest_level,
+                authentic=self._is_authentic(row, tenant),
+            )
 
-    def _is_authentic(self, row: Any) -> bool:
-        expected = _mac(self._context.secrets.get(SecretName.API_KEYS), row._mapping)
-        return hmac.compare_digest(expected, row.mac)
-
-    def _insert(self, session: Session, key: ApiKey, by: By) -> NewApiKey:
-        token = f"vf_{key.prefix}_{os.urandom(32).hex()}"
-        row: dict[str, Any] = {
-            **{name: getattr(key, name) for name in _FIELDS - {"tenant"}},
-            "tenant_id": tenant_of(session, key.tenant).id,
-            "token_hash": _token_hash(token),
-            "rights": ",".join(sorted(key.rights)),
-        }
-        secret = self._context.secrets.get(SecretName.API_KEYS)
-        row["mac"] = _mac(secret, {**row, "tenant": key.tenant})
-        session.add(ApiKeyRow(**row))
-        entry = Entry("key-create", "created", by, key.tenant, detail=key.prefix)
-        self._context.audit_log.append(session, entry)
-        return NewApiKey(key=key, token=token)
-
-    def _revoke(self, session: Session, row: Any) -> None:
-        """Note the moment in a row; one that is not authentic stays so."""
-        columns: dict[str, Any] = {"revoked_at": self._context.clock()}
-        if self._is_authentic(row):
-            secret = self._context.secrets.get(SecretName.API_KEYS)
-            columns["mac"] = _mac(secret, {**row._mapping, **columns})
-        _update(session, row.id, **columns)
+    def _is_authentic(self, row: ApiKeyRow, tenant: str) -> bool:
+        return hmac.compare_digest(_mac(self._secret, row, tenant), row.mac)
 
 
-_AUTHENTICATED = (
-    "id",
-    "tenant_id",
-    "tenant",
-    "prefix",
-    "token_hash",
-    "rights",
-    "expires_at",
-    "revoked_at",
-    "lowest_level",
-)
-"""What the MAC of a row covers; `tenant` is the name, which the tenant's own row could change."""
-_FIELDS = set(ApiKey.__dataclass_fields__) - {"authentic"}
-_KEYS: Any = sa.select(
-    *(column for column in ApiKeyRow.__table__.columns),
-    TenantRow.name.label("tenant"),
-).join(TenantRow, TenantRow.id == ApiKeyRow.tenant_id)
+NOBODY = (None, "")
+_KEYS: Any = sa.select(ApiKeyRow, TenantRow.name).join(TenantRow)
 _OF_PREFIX = _KEYS.where(ApiKeyRow.prefix == sa.bindparam("prefix"))
 
 
@@ -281,28 +246,22 @@ def _unreadable_is_altered() -> Iterator[None]:
         ) from None
 
 
-def _update(session: Session, key_id: str, **columns: Any) -> None:
-    session.execute(sa.update(ApiKeyRow).where(ApiKeyRow.id == key_id).values(columns))
-
-
-def _mac(secret: bytes, values: Mapping[str, Any]) -> bytes:
-    parts = [_part(values[name]) for name in _AUTHENTICATED]
+def _mac(secret: bytes, row: ApiKeyRow, tenant: str) -> bytes:
+    """MAC of all that gives rights, the tenant's name included, which its own row could change."""
+    ends = row.expires_at, row.revoked_at
+    values = (
+        row.id,
+        row.tenant_id,
+        tenant,
+        row.prefix,
+        row.token_hash,
+        row.rights,
+        *(None if at is None else at.astimezone(UTC).isoformat() for at in ends),
+        row.lowest_level,
+    )
+    # No column that may be NULL holds a number, so 0 cannot be taken for one.
+    parts = (0 if value is None else value for value in values)
     return hmac.digest(secret, encode_parts("api key", *parts), hashlib.sha256)
-
-
-def _part(value: object) -> str | bytes | int:
-    match value:
-        case datetime():
-            return value.astimezone(UTC).isoformat(timespec="microseconds")
-        case str() | bytes():
-            return value
-        case _:
-            return 0  # NULL; no column that may be NULL holds a number
-
-
-@functools.lru_cache(maxsize=256)
-def _granted(rights: str) -> frozenset[Right]:
-    return frozenset(right for right in Right if right in rights.split(","))
 
 
 def _rights(rights: Iterable[Right | str]) -> frozenset[Right]:

@@ -23,13 +23,7 @@ from templates.store.audit_log import By, Entry
 from templates.store.context import StoreContext
 from templates.store.database import delete
 from templates.store.identifiers import UnknownTenant, checked_subject_id
-from templates.store.lockout import (
-    AttemptsStatus,
-    LockedOut,
-    LockoutPolicy,
-    Replayed,
-    Superseded,
-)
+from templates.store.lockout import AttemptsStatus, LockedOut, LockoutPolicy, Replayed
 from templates.store.schema import SEALED, AuditRow, FailedAttemptsRow, SubjectRow, TenantRow
 from templates.store.subjects import SubjectTemplate, opened_template
 from templates.store.tenants import RetiredRotation
@@ -42,14 +36,9 @@ TRIES = 4
 
 @dataclass(frozen=True)
 class Attempt:
-    """What a probe is to be decided by.
+    """What a probe is decided by: the tenant's current epoch, and the subject's template.
 
-    Attributes
-    ----------
-    rotation_epoch
-        The tenant's current one.
-    template
-        The subject's; None where there is none of the contract.
+    `template` is None where there is none of the contract.
     """
 
     rotation_epoch: int
@@ -71,6 +60,10 @@ class Decided(Protocol):
 
 
 D = TypeVar("D", bound=Decided)
+
+
+class _Superseded(Exception):
+    """The template that was decided on is no longer the subject's; nothing was written."""
 
 
 class Attempts:
@@ -121,7 +114,7 @@ class Attempts:
         probe = self._parameters(tenant, subject_id, token=token, contract_id=contract_id)
         database = self._context.database
         for _ in range(TRIES):
-            with contextlib.suppress(Superseded, RetiredRotation):
+            with contextlib.suppress(_Superseded, RetiredRotation):
                 with database.read() as session:
                     attempt = self._read(session, probe)
                 decided = compare(attempt)
@@ -140,7 +133,7 @@ class Attempts:
     def reset(self, tenant: str, subject_id: str, *, by: By) -> bool:
         """Forget the consecutive failures on a subject, its lock and its being disabled.
 
-        False if there was none of these. The total stays.
+        False if there was none of these.
         """
         probe = self._parameters(tenant, subject_id)
         with self._context.database.write() as session:
@@ -190,7 +183,7 @@ class Attempts:
     ) -> LockedOut | Replayed | None:
         """Record a decision inside a write; returns why it must be withheld, or None.
 
-        :class:`Superseded` if the subject's template is not the one of `attempt`.
+        :class:`_Superseded` if the subject's template is not the one of `attempt`.
         """
         state = _state_of(session, _STATE, probe)
         refusal = self._refusal(state)
@@ -218,7 +211,7 @@ class Attempts:
         subject, counts, now = state.SubjectRow, state.FailedAttemptsRow, self._context.clock()
         stored = None if subject is None else subject.template_id
         if stored != (None if attempt.template is None else attempt.template.template_id):
-            raise Superseded
+            raise _Superseded
         if accepted:
             if subject is None:
                 raise ValueError("a subject that is not enrolled cannot be accepted")
@@ -228,18 +221,15 @@ class Attempts:
             return
         if counts is None:
             tenant_id = state.TenantRow.id
-            counts = FailedAttemptsRow(
-                tenant_id=tenant_id, pseudonym=pseudonym, consecutive=0, total=0
-            )
+            counts = FailedAttemptsRow(tenant_id=tenant_id, pseudonym=pseudonym, consecutive=0)
             session.add(counts)
         counts.consecutive += 1
-        counts.total += 1
         counts.last_failed_at = now
 
     def _status(self, counts: FailedAttemptsRow | None) -> AttemptsStatus | None:
         if counts is None:
             return None
-        return self._policy.status(counts.consecutive, counts.total, counts.last_failed_at)
+        return self._policy.status(counts.consecutive, counts.last_failed_at)
 
     def _parameters(
         self,
@@ -314,5 +304,5 @@ def _state_of(session: Session, query: Any, probe: Mapping[str, Any]) -> Any:
     """The one row of a query; :class:`UnknownTenant` where there is none."""
     state = session.execute(query, probe).one_or_none()
     if state is None:
-        raise UnknownTenant.of_name(probe["tenant"])
+        raise UnknownTenant(f"there is no tenant {probe['tenant']!r}")
     return state

@@ -29,7 +29,7 @@ from templates.store.audit_chain import (
     Head,
     good_lines,
 )
-from templates.store.audit_log import By, Entry
+from templates.store.audit_log import PROGRAM, By, Entry
 from templates.store.context import StoreContext
 from templates.store.database import delete
 from templates.store.receipts import Receipt, sign_claims, verify_claims
@@ -50,7 +50,9 @@ class Archive:
     lines: int
 
 
-def archive_lines(context: StoreContext, file: Path, *, through: int | None, by: By) -> Archive:
+def archive_audit_log(
+    context: StoreContext, file: Path, *, through: int | None, by: By = PROGRAM
+) -> Archive:
     """Verify the lines up to a number, write them to a new file, and remove them from the log.
 
     In one write, for which every other one waits. The file is complete on disk before the lines
@@ -90,7 +92,7 @@ def _last_to_go(session: Session, context: StoreContext, through: int | None) ->
 def write_archive(
     session: Session, context: StoreContext, file: Path, through: int | None
 ) -> Archive:
-    """:func:`archive_lines` inside a write, without the line that tells of it."""
+    """:func:`archive_audit_log` inside a write, without the line that tells of it."""
     key = context.audit_log.key
     head = Head.read(session, key)
     end = head.last.sequence if through is None else min(through, head.last.sequence)

@@ -140,9 +140,9 @@ class AuditLog:
             if is_used(session, token):
                 raise Replayed
 
-    def lines(self, *, after: int = 0, batch: int = BATCH) -> Iterator[Line]:
+    def lines(self, *, after: int = 0) -> Iterator[Line]:
         """Lines in their order, beginning after one; read in batches, and not verified."""
-        query = LINES.order_by(AuditRow.sequence).limit(batch)
+        query = LINES.order_by(AuditRow.sequence).limit(BATCH)
         while True:
             with self._database.read() as session:
                 rows = session.execute(query.where(AuditRow.sequence > after)).all()

@@ -13,7 +13,6 @@ import sqlalchemy as sa
 from sqlalchemy.orm import Session
 
 from templates.errors import StoreError
-from templates.store.api_keys import ApiKeys
 from templates.store.attempts import COUNT_RETENTION
 from templates.store.audit_chain import (
     START,
@@ -24,7 +23,7 @@ from templates.store.audit_chain import (
     good_lines,
 )
 from templates.store.audit_log import TENANT_ERASE, template_digest
-from templates.store.context import StoreContext
+from templates.store.repository import TemplateStore
 from templates.store.schema import FailedAttemptsRow, SubjectRow, TenantRow
 
 KEY_ALTERED = "the row of an API key was made up or altered"
@@ -74,7 +73,6 @@ class _Failures:
     tenant: str
     last_at: datetime
     consecutive: int = 0
-    total: int = 0
 
 
 @dataclass
@@ -113,15 +111,13 @@ class LogFindings:
     def _count(self, pseudonym: str, tenant: str, at: datetime) -> None:
         failures = self.failures.setdefault(pseudonym, _Failures(tenant, at))
         if failures.last_at <= at - _FORGOTTEN_AFTER:
-            failures.consecutive = failures.total = 0
+            failures.consecutive = 0
         failures.consecutive += 1
-        failures.total += 1
         failures.last_at = at
 
 
 def verify_audit_log(
-    context: StoreContext,
-    api_keys: ApiKeys,
+    store: TemplateStore,
     *,
     anchor: Anchor | None = None,
     progress: Callable[[int], None] | None = None,
@@ -132,8 +128,8 @@ def verify_audit_log(
     an `anchor`, an earlier head, an old state of the whole log is not told from a new one. What
     lines in an archive tell is not known.
     """
-    findings, key, lines, last = LogFindings(), context.audit_log.key, 0, START
-    with context.database.snapshot() as session:
+    findings, key, lines, last = LogFindings(), store.audit_log.key, 0, START
+    with store.database.snapshot() as session:
         try:
             head = Head.read(session, key)
             last, is_anchored = head.base, anchor in (None, head.base)
@@ -148,17 +144,17 @@ def verify_audit_log(
         except ChainBreak as problem:
             return Verification(lines, last, problem)
         records = (
-            *_keys(findings, api_keys, session),
+            *_keys(findings, store, session),
             *_tenants(findings, session),
-            *_enrollments(findings, context, session),
-            *_counts(findings, context, session),
+            *_enrollments(findings, store, session),
+            *_counts(findings, store, session),
         )
         return Verification(lines, last, None, records)
 
 
-def _keys(findings: LogFindings, api_keys: ApiKeys, session: Session) -> Iterator[RecordProblem]:
+def _keys(findings: LogFindings, store: TemplateStore, session: Session) -> Iterator[RecordProblem]:
     try:
-        keys = api_keys.read_all(session)
+        keys = store.api_keys.read_all(session)
     except StoreError:
         yield RecordProblem(KEY_ALTERED, "a row that cannot be read")
         return
@@ -179,20 +175,20 @@ def _tenants(findings: LogFindings, session: Session) -> Iterator[RecordProblem]
 
 
 def _enrollments(
-    findings: LogFindings, context: StoreContext, session: Session
+    findings: LogFindings, store: TemplateStore, session: Session
 ) -> Iterator[RecordProblem]:
     query = sa.select(TenantRow.name, SubjectRow.subject_id, SubjectRow.template_id).join(
         SubjectRow, SubjectRow.tenant_id == TenantRow.id
     )
     for tenant, subject_id, template_id in session.execute(query):
-        pseudonym = context.signer.pseudonym(tenant, subject_id)
+        pseudonym = store.signer.pseudonym(tenant, subject_id)
         digest = template_digest(template_id)
         if findings.templates.get(pseudonym, digest) != digest:
             yield RecordProblem(ENROLLMENT_PUT_BACK, pseudonym)
 
 
 def _counts(
-    findings: LogFindings, context: StoreContext, session: Session
+    findings: LogFindings, store: TemplateStore, session: Session
 ) -> Iterator[RecordProblem]:
     stored = {row.pseudonym: row for row in session.scalars(sa.select(FailedAttemptsRow))}
     for pseudonym, failures in findings.failures.items():
@@ -201,8 +197,7 @@ def _counts(
         holds = (
             row is not None
             and row.consecutive >= failures.consecutive
-            and row.total >= failures.total
             and abs(row.last_failed_at - failures.last_at) < _SAME_WRITE
         )
-        if not holds and failures.last_at > context.clock() - _FORGOTTEN_AFTER:
+        if not holds and failures.last_at > store.clock() - _FORGOTTEN_AFTER:
             yield RecordProblem(COUNT_LIFTED, pseudonym)

@@ -212,9 +212,6 @@ class Database:
                 "the service first and start it again"
             )
 
-    def __repr__(self) -> str:
-        return f"Database({self.url.render_as_string(hide_password=True)!r})"
-
 
 def delete(session: Session, table: type[Base], *conditions: Any) -> int:
     """Delete rows; returns how many."""

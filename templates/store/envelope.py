@@ -13,13 +13,7 @@ from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 
 from templates.errors import SealError
-from templates.keys.sealing import (
-    NONCE_BYTES,
-    TAG_BYTES,
-    MasterKeyring,
-    encode_parts,
-    sealed_key_id,
-)
+from templates.keys.sealing import NONCE_BYTES, TAG_BYTES, MasterKeyring, encode_parts
 from templates.store.schema import SubjectRow
 
 _VERSION = b"\x01"
@@ -37,7 +31,6 @@ def seal_template(subject: SubjectRow, wire: bytes, keyring: MasterKeyring) -> N
     subject.wrapped_key = keyring.seal(
         data_key, purpose=DATA_KEY_PURPOSE, bound_to=[subject.tenant_id, subject.id]
     )
-    subject.wrapping_key = sealed_key_id(subject.wrapped_key)
 
 
 def open_template(subject: SubjectRow, keyring: MasterKeyring) -> bytes:

@@ -1,6 +1,8 @@
 """Erasing a subject or a tenant: everything about it goes, a signed receipt comes."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import sqlalchemy as sa
 from sqlalchemy.orm import Session
@@ -17,9 +19,13 @@ from templates.store.receipts import (
     latest_receipt,
     tenant_receipt_name,
 )
+from templates.store.retention import Retention
 from templates.store.schema import Base, FailedAttemptsRow, SubjectRow, TenantRow
 from templates.store.subjects import subject_of
 from templates.store.tenants import tenant_of
+
+BATCH = 100
+RETENTION = By("retention")
 
 
 @dataclass(frozen=True)
@@ -58,16 +64,44 @@ class Erasures:
             receipt, erased = self._erase(session, tenant, subject_id, by)
         return Erasure(receipt, erased, log_purged=self._context.database.purge_log())
 
+    def erase_expired(self, retention: Retention, *, by: By = RETENTION, batch: int = BATCH) -> int:
+        """Erase every subject whose retention has ended, of all tenants; returns how many.
+
+        Each like any other subject, with a receipt and a line in the audit log, in a transaction of
+        its own. It may be interrupted, run again, and run by several workers at once. `batch`
+        subjects are listed at once.
+        """
+        erased, due = 0, retention.expired(self._context.clock())
+        while rows := self._listed(due, batch):
+            for row in rows:
+                # The row, too: a subject of the same name may have been enrolled anew.
+                is_due = sa.and_(SubjectRow.id == row.id, due)
+                erased += self.erase_if(row.name, row.subject_id, is_due, by=by)
+            self._context.database.purge_log()
+        return erased
+
     def erase_if(
         self, tenant: str, subject_id: str, condition: sa.ColumnElement[bool], *, by: By
     ) -> bool:
-        """:meth:`erase` a subject whose row meets a condition when it is erased; False otherwise.
+        """:meth:`erase` a subject if its row meets a condition when it is erased.
 
-        Emptying SQLite's write-ahead log is left to the caller, who may erase many.
+        So one that was enrolled again or accepted since it was listed survives. Emptying SQLite's
+        write-ahead log is left to the caller, who may erase many.
         """
         with self._context.database.write() as session:
             is_met = session.scalar(sa.select(SubjectRow.id).where(condition)) is not None
             return is_met and self._erase(session, tenant, subject_id, by)[1]
+
+    def _listed(self, due: sa.ColumnElement[bool], batch: int) -> Sequence[Any]:
+        query = sa.select(SubjectRow.id, TenantRow.name, SubjectRow.subject_id).join(TenantRow)
+        with self._context.database.read() as session:
+            return session.execute(query.where(due).limit(batch)).all()
+
+    def expired(self, retention: Retention) -> int:
+        """Count the subjects that :meth:`erase_expired` would erase now."""
+        due = retention.expired(self._context.clock())
+        with self._context.database.read() as session:
+            return session.execute(sa.select(sa.func.count(SubjectRow.id)).where(due)).scalar_one()
 
     def receipt(self, tenant: str, subject_id: str) -> Receipt | None:
         """Return the latest erasure receipt of a subject, or None."""
@@ -106,7 +140,7 @@ class Erasures:
         receipt = None if subject else latest_receipt(session, pseudonym)
         outcome = "receipt_repeated"
         if receipt is None:
-            outcome, now = "erased" if subject else "nothing_held", self._context.clock()
+            outcome = "erased" if subject else "nothing_held"
             subjects = delete(session, SubjectRow, SubjectRow.id == subject.id) if subject else 0
             receipt = self._context.signer.sign(
                 SUBJECT_KIND,
@@ -119,14 +153,14 @@ class Erasures:
                     **dict.fromkeys(("template", "data_key", "metadata"), subjects),
                     "failed_attempts": failed_attempts,
                 },
-                erased_at=now,
+                erased_at=self._context.clock(),
             )
-            keep_receipt(session, pseudonym, receipt, now)
+            keep_receipt(session, pseudonym, receipt)
         self._context.audit_log.append(session, Entry("erase", outcome, by, tenant, pseudonym))
         return receipt, outcome == "erased"
 
     def _erase_tenant(self, session: Session, tenant: str, by: By) -> tuple[Receipt, bool]:
-        name, now = tenant_receipt_name(tenant), self._context.clock()
+        name = tenant_receipt_name(tenant)
         try:
             owner = tenant_of(session, tenant)
         except UnknownTenant:
@@ -145,9 +179,9 @@ class Erasures:
             held=True,
             rotation_epoch=owner.rotation_epoch,
             erased=erased,
-            erased_at=now,
+            erased_at=self._context.clock(),
         )
-        keep_receipt(session, name, receipt, now)
+        keep_receipt(session, name, receipt)
         entry = Entry(TENANT_ERASE, "erased", by, tenant, detail=owner.id)
         self._context.audit_log.append(session, entry)
         return receipt, True

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 
-from templates.errors import StoreBusy, StoreError
+from templates.errors import StoreError
 
 _MAX_DOUBLINGS = 64
 
@@ -13,7 +13,6 @@ class AttemptsStatus:
     """Failures on a subject; `consecutive` counts from the last accept or reset on."""
 
     consecutive: int
-    total: int
     last_failed_at: datetime
     locked_until: datetime | None
     disabled_at: datetime | None
@@ -33,15 +32,7 @@ class LockoutPolicy:
     longest_s: float = 3600.0
     disable_at: int = 50
 
-    def __post_init__(self) -> None:
-        if self.after < 0 or not 0 < self.first_s <= self.longest_s:
-            raise StoreError(
-                "a lock follows 0 or more failures and lasts from first_s to longest_s"
-            )
-        if self.after and self.disable_at < self.after:
-            raise StoreError("a subject is disabled after no fewer failures than lock it")
-
-    def status(self, consecutive: int, total: int, last_failed_at: datetime) -> AttemptsStatus:
+    def status(self, consecutive: int, last_failed_at: datetime) -> AttemptsStatus:
         """Status of a subject with so many failures: the lock follows from the counts."""
         locked_until = disabled_at = None
         if self.after and consecutive >= self.after:
@@ -49,7 +40,7 @@ class LockoutPolicy:
             seconds = min(self.first_s * 2.0**doublings, self.longest_s)
             locked_until = last_failed_at + timedelta(seconds=seconds)
             disabled_at = last_failed_at if consecutive >= self.disable_at else None
-        return AttemptsStatus(consecutive, total, last_failed_at, locked_until, disabled_at)
+        return AttemptsStatus(consecutive, last_failed_at, locked_until, disabled_at)
 
     def refusal(self, status: AttemptsStatus | None, now: datetime) -> "LockedOut | None":
         """Why nothing is decided on the subject now; None where it is not locked.
@@ -66,33 +57,21 @@ class LockoutPolicy:
         return LockedOut((until - now).total_seconds()) if is_locked else None
 
 
-class Superseded(StoreBusy):
-    """The template that was decided on is no longer the subject's; nothing was written."""
-
-    def __init__(self) -> None:
-        super().__init__(
-            "the subject was enrolled, enrolled again or erased while the probe was compared: "
-            "send it again"
-        )
-
-
 class LockedOut(StoreError):
     """Too many failed attempts on the subject; without `retry_after_s` an operator must reset it.
 
     `recorded` is whether the audit log has a line of it.
     """
 
-    retry_after_s: float | None = None
     recorded = False
 
-    def __init__(self, retry_after_s: float | None, *, recorded: bool = False) -> None:
+    def __init__(self, retry_after_s: float | None) -> None:
         super().__init__(
             "too many failed attempts on this subject: it is disabled until an operator resets it"
             if retry_after_s is None
             else f"too many failed attempts on this subject: try again in {retry_after_s:.0f} s"
         )
         self.retry_after_s = retry_after_s
-        self.recorded = recorded
 
 
 class Replayed(StoreError):

@@ -10,12 +10,11 @@ another template, and two of them meet in the embedding.
 from dataclasses import dataclass
 from pathlib import Path
 
-from templates.store.api_keys import ApiKeys
 from templates.store.audit_archive import Archive, write_archive
 from templates.store.audit_chain import begin_chain
-from templates.store.audit_log import By, Entry
-from templates.store.context import StoreContext
+from templates.store.audit_log import PROGRAM, By, Entry
 from templates.store.receipts import sign_again
+from templates.store.repository import TemplateStore
 from templates.store.secrets import SecretName
 
 KEPT = frozenset({SecretName.PSEUDONYM, SecretName.LIFTS})
@@ -30,7 +29,7 @@ class Renewed:
     refused: tuple[str, ...]
 
 
-def renew_secrets(context: StoreContext, api_keys: ApiKeys, archive: Path, *, by: By) -> Renewed:
+def renew_secrets(store: TemplateStore, archive: Path, *, by: By = PROGRAM) -> Renewed:
     """Draw every secret but those that stay anew, in one write.
 
     Put a new master key in force first, and drop the old one afterwards. `archive` is a new file
@@ -43,18 +42,16 @@ def renew_secrets(context: StoreContext, api_keys: ApiKeys, archive: Path, *, by
     StoreError
         If the archive cannot be written.
     """
-    old_receipt_key = context.secrets.get(SecretName.RECEIPT)
+    old_receipt_key = store.secrets.get(SecretName.RECEIPT)
 
-    with context.database.write() as session:
-        archived = write_archive(session, context, archive, None)
-        fresh = {
-            name: context.secrets.draw(session, name) for name in SecretName if name not in KEPT
-        }
-        refused = api_keys.authenticate_again(session, fresh[SecretName.API_KEYS])
+    with store.database.write() as session:
+        archived = write_archive(session, store, archive, None)
+        fresh = {name: store.secrets.draw(session, name) for name in SecretName if name not in KEPT}
+        refused = store.api_keys.authenticate_again(session, fresh[SecretName.API_KEYS])
         receipts = sign_again(session, old_receipt_key, fresh[SecretName.RECEIPT])
         key = fresh[SecretName.CHAIN]
         begin_chain(session, key, archived.last)
-        context.audit_log.append(session, Entry("secrets-renew", "renewed", by), key=key)
-    context.secrets.load()
-    context.database.purge_log()
+        store.audit_log.append(session, Entry("secrets-renew", "renewed", by), key=key)
+    store.secrets.load()
+    store.database.purge_log()
     return Renewed(archived, receipts, refused)

@@ -1,29 +1,20 @@
 """The store of a deployment, opened from a URL and a keyring."""
 
 import os
-from collections.abc import Callable
-from pathlib import Path
 
 import sqlalchemy as sa
-from sqlalchemy.orm import Session
 
 from templates.keys.sealing import MasterKeyring
 from templates.store import migrate
 from templates.store.api_keys import ApiKeys
 from templates.store.attempts import Attempts
-from templates.store.audit_archive import Archive, archive_lines
-from templates.store.audit_chain import Anchor, BrokenAuditLog, begin_chain
-from templates.store.audit_log import PROGRAM, By
-from templates.store.audit_verification import Verification, verify_audit_log
+from templates.store.audit_chain import BrokenAuditLog, begin_chain
 from templates.store.context import StoreContext
 from templates.store.database import Database
 from templates.store.erasure import Erasures
 from templates.store.identifiers import Clock, utc_now
 from templates.store.lockout import LockoutPolicy
-from templates.store.renewal import Renewed, renew_secrets
 from templates.store.rerotation import Rerotation
-from templates.store.retention import RetentionJob
-from templates.store.rewrap import WrappedKeys
 from templates.store.schema import AuditHeadRow, SecretRow
 from templates.store.secrets import SecretName
 from templates.store.subjects import Subjects
@@ -34,10 +25,12 @@ _TRIAL_NAME = "trial-write"
 _TRIAL_BYTES = 128 * 1024
 
 
-class TemplateStore:
+class TemplateStore(StoreContext):
     """Everything that Veilface keeps, in SQLite or PostgreSQL.
 
-    Each part has its own attribute; this class has only what concerns all of them.
+    Each part has its own attribute; this class has only what concerns all of them. What is done
+    beside a service in use, or while it is stopped, are functions: :func:`verify_audit_log`,
+    :func:`archive_audit_log`, :func:`rewrap_keys`, :func:`renew_secrets`.
     """
 
     def __init__(
@@ -52,19 +45,13 @@ class TemplateStore:
         lockout: LockoutPolicy = _LOCKOUT,
     ) -> None:
         database = Database(url, pool_size=pool_size, max_overflow=max_overflow, timeout=timeout)
-        self._context = context = StoreContext.open(database, keyring, clock)
-        self.database = database
-        self.secrets = context.secrets
-        self.signer = context.signer
-        self.audit_log = context.audit_log
-        self.tenants = Tenants(context)
-        self.api_keys = ApiKeys(context)
-        self.subjects = Subjects(context)
-        self.attempts = Attempts(context, lockout)
-        self.erasures = Erasures(context)
-        self.retention = RetentionJob(context, self.erasures)
-        self.rerotation = Rerotation(context, self.tenants)
-        self.wrapped_keys = WrappedKeys(context)
+        super().__init__(database, keyring, clock)
+        self.tenants = Tenants(self)
+        self.api_keys = ApiKeys(self)
+        self.subjects = Subjects(self)
+        self.attempts = Attempts(self, lockout)
+        self.erasures = Erasures(self)
+        self.rerotation = Rerotation(self, self.tenants)
 
     def upgrade(self) -> None:
         """Bring the schema to this program's version; safe when several workers start at once.
@@ -74,40 +61,22 @@ class TemplateStore:
         """
         migrate.upgrade(self.database)
         with self.database.write() as session:
-            self._set_up(session)
+            made = self.secrets.make_missing(session)
+            has_begun = session.scalar(sa.select(AuditHeadRow.id)) is not None
+            if made and (has_begun or SecretName.CHAIN not in made):
+                raise BrokenAuditLog(
+                    f"secrets of the deployment are missing ({', '.join(sorted(made))}): "
+                    "restore the database from a backup"
+                )
+            if made:
+                begin_chain(session, made[SecretName.CHAIN])
         self.check()
-
-    def _set_up(self, session: Session) -> None:
-        made = self.secrets.make_missing(session)
-        if not made:
-            return
-        has_begun = session.scalar(sa.select(AuditHeadRow.id)) is not None
-        if has_begun or SecretName.CHAIN not in made:
-            raise BrokenAuditLog(
-                f"secrets of the deployment are missing ({', '.join(sorted(made))}): "
-                "restore the database from a backup"
-            )
-        begin_chain(session, made[SecretName.CHAIN])
 
     def check(self) -> None:
         """Raise, naming the remedy, unless schema and master key are the right ones."""
         migrate.check(self.database)
         self.secrets.load()
         self.secrets.get(SecretName.CHAIN)
-
-    def verify_audit_log(
-        self, *, anchor: Anchor | None = None, progress: Callable[[int], None] | None = None
-    ) -> Verification:
-        """Walk over the audit log, and hold rows against it (:func:`verify_audit_log`)."""
-        return verify_audit_log(self._context, self.api_keys, anchor=anchor, progress=progress)
-
-    def archive_audit_log(self, file: Path, *, through: int | None, by: By = PROGRAM) -> Archive:
-        """Move old lines of the audit log into a file (:func:`archive_lines`)."""
-        return archive_lines(self._context, file, through=through, by=by)
-
-    def renew_secrets(self, archive: Path, *, by: By = PROGRAM) -> Renewed:
-        """Make every secret anew after a theft (:func:`renew_secrets`)."""
-        return renew_secrets(self._context, self.api_keys, archive, by=by)
 
     def close(self) -> None:
         """Close the idle connections of this process."""
@@ -124,8 +93,7 @@ class TemplateStore:
         A full disk and a read-only database still answer queries. On a full disk a page or two
         often find room that an enrollment does not, so this writes as much as one.
         """
-        trial = SecretRow(name=_TRIAL_NAME, wrapped_key=os.urandom(_TRIAL_BYTES), wrapping_key="")
-        trial.created_at = self._context.clock()
+        trial = SecretRow(name=_TRIAL_NAME, wrapped_key=os.urandom(_TRIAL_BYTES))
         with self.database.write() as session:
             session.add(trial)
             session.flush()

@@ -79,8 +79,7 @@ class Rerotation:
 
         @functools.cache
         def rotation(epoch: int) -> TenantRotation:
-            key = self._tenants.rotation_key(tenant, epoch=epoch).key
-            return TenantRotation(key, binding.axes)
+            return TenantRotation(self._tenants.rotation_key(tenant, epoch), binding.axes)
 
         while True:
             moved, failed, after = self._move_batch(tenant, binding, rotation, after, batch)

@@ -13,7 +13,7 @@ import sqlalchemy as sa
 from sqlalchemy.orm import undefer
 
 from templates.errors import SealError
-from templates.keys.sealing import sealed_key_id
+from templates.keys.sealing import KEY_ID_BYTES
 from templates.store.context import StoreContext
 from templates.store.envelope import DATA_KEY_PURPOSE
 from templates.store.schema import RotationKeyRow, SecretRow, SubjectRow
@@ -37,79 +37,80 @@ WRAPPED = (
 )
 
 
-class WrappedKeys:
-    """The blobs under master keys, all over the store."""
+def rewrap_keys(
+    context: StoreContext, *, batch: int = 200, progress: Callable[[int], None] | None = None
+) -> int:
+    """Bring every wrapped blob under the keyring's current key; returns how many were not.
 
-    def __init__(self, context: StoreContext) -> None:
-        self._context = context
+    `progress` is called after each transaction, of `batch` rows, with the number it wrapped.
 
-    def rewrap(self, *, batch: int = 200, progress: Callable[[int], None] | None = None) -> int:
-        """Bring every wrapped blob under the keyring's current key; returns how many were not.
+    Raises
+    ------
+    SealError
+        At the end, if blobs were altered or are under a key that the keyring lacks. All others
+        are wrapped again.
+    """
+    keyring, current = context.keyring, None
+    total = broken = 0
+    while keyring.current != current:  # again where the key file changed once more meanwhile
+        current = keyring.current
+        for wrapped in WRAPPED:
+            after: tuple[Any, ...] | None = ()
+            while after is not None:
+                changed, failed, after = _rewrap(context, wrapped, after, batch)
+                total, broken = total + changed, broken + failed
+                if progress is not None and changed:
+                    progress(changed)
+    context.database.purge_log()
+    if broken:
+        raise SealError(
+            f"{broken} blobs do not open: their rows were altered, or a master key is missing. "
+            "Put the key back and run it again, or enroll these subjects again, or erase them"
+        )
+    return total
 
-        `progress` is called after each transaction, of `batch` rows, with the number it wrapped.
 
-        Raises
-        ------
-        SealError
-            At the end, if blobs were altered or are under a key that the keyring lacks. All others
-            are wrapped again.
-        """
-        keyring, current = self._context.keyring, None
-        total = broken = 0
-        while keyring.current != current:  # again where the key file changed once more meanwhile
-            current = keyring.current
-            for wrapped in WRAPPED:
-                after: tuple[Any, ...] | None = ()
-                while after is not None:
-                    changed, failed, after = self._rewrap(wrapped, after, batch)
-                    total, broken = total + changed, broken + failed
-                    if progress is not None and changed:
-                        progress(changed)
-        self._context.database.purge_log()
-        if broken:
-            raise SealError(
-                f"{broken} blobs do not open: their rows were altered, or a master key is missing. "
-                "Put the key back and run it again, or enroll these subjects again, or erase them"
-            )
-        return total
+def count_wrapped(context: StoreContext) -> dict[str, int]:
+    """Count the blobs under each master key id; one that is absent wraps nothing any more."""
+    counts: Counter[str] = Counter()
+    with context.database.read() as session:
+        for wrapped in WRAPPED:
+            query = sa.select(_key_id(wrapped).label("master_key"), sa.func.count())
+            for key_id, count in session.execute(query.group_by("master_key")):
+                counts[key_id.hex()] += count
+    return counts
 
-    def count(self) -> dict[str, int]:
-        """Count the blobs under each master key id; one that is absent wraps nothing any more."""
-        counts: Counter[str] = Counter()
-        with self._context.database.read() as session:
-            for wrapped in WRAPPED:
-                column = wrapped.table.wrapping_key
-                query = sa.select(column, sa.func.count()).group_by(column)
-                for key_id, count in session.execute(query):
-                    counts[key_id] += count
-        return counts
 
-    def _rewrap(
-        self, wrapped: Wrapped, after: tuple[Any, ...], batch: int
-    ) -> tuple[int, int, tuple[Any, ...] | None]:
-        """Wrap the next rows again; returns how many, how many do not open, and the last key."""
-        keyring, table, broken = self._context.keyring, wrapped.table, 0
-        key = table.__table__.primary_key
-        with self._context.database.write() as session:
-            query = (
-                sa.select(table)
-                .options(undefer(table.wrapped_key))
-                .where(table.wrapping_key != keyring.current)
-                .order_by(*key)
-                .limit(batch)
-            )
-            if after:
-                query = query.where(sa.tuple_(*key) > sa.tuple_(*map(sa.literal, after)))
-            rows = session.scalars(query).all()
-            for row in rows:
-                bound_to = [getattr(row, name) for name in wrapped.bound_to]
-                try:
-                    row.wrapped_key = keyring.rewrap(
-                        row.wrapped_key, purpose=wrapped.purpose, bound_to=bound_to
-                    )
-                except SealError:
-                    broken += 1
-                    continue
-                row.wrapping_key = sealed_key_id(row.wrapped_key)
-            last = sa.inspect(rows[-1]).identity if rows else None
-        return len(rows) - broken, broken, last
+def _rewrap(
+    context: StoreContext, wrapped: Wrapped, after: tuple[Any, ...], batch: int
+) -> tuple[int, int, tuple[Any, ...] | None]:
+    """Wrap the next rows again; returns how many, how many do not open, and the last key."""
+    keyring, table, broken = context.keyring, wrapped.table, 0
+    key = table.__table__.primary_key
+    with context.database.write() as session:
+        query = (
+            sa.select(table)
+            .options(undefer(table.wrapped_key))
+            .where(_key_id(wrapped) != bytes.fromhex(keyring.current))
+            .order_by(*key)
+            .limit(batch)
+        )
+        if after:
+            query = query.where(sa.tuple_(*key) > sa.tuple_(*map(sa.literal, after)))
+        rows = session.scalars(query).all()
+        for row in rows:
+            bound_to = [getattr(row, name) for name in wrapped.bound_to]
+            try:
+                row.wrapped_key = keyring.rewrap(
+                    row.wrapped_key, purpose=wrapped.purpose, bound_to=bound_to
+                )
+            except SealError:
+                broken += 1
+                continue
+        last = sa.inspect(rows[-1]).identity if rows else None
+    return len(rows) - broken, broken, last
+
+
+def _key_id(wrapped: Wrapped) -> Any:
+    """The id of the master key, which follows a blob's version (``templates.keys.sealing``)."""
+    return sa.func.substr(wrapped.table.wrapped_key, 2, KEY_ID_BYTES, type_=sa.LargeBinary)

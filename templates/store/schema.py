@@ -1,7 +1,6 @@
 """The tables of the store.
 
-A secret is stored sealed, and beside each blob that a master key sealed stands the id of that key
-(``wrapping_key``), so that a rotation of the master key finds the rows that it has to wrap again.
+A secret is stored sealed: a column ``wrapped_key`` by a master key, whose id it begins with.
 Receipts and audit lines outlive a subject: they name it by a keyed pseudonym only.
 """
 
@@ -36,7 +35,6 @@ SERIAL = BigInteger().with_variant(Integer, "sqlite")
 
 RowId = Annotated[str, mapped_column(UUID_HEX, primary_key=True)]
 TenantId = Annotated[str, mapped_column(UUID_HEX, ForeignKey("tenants.id", ondelete="CASCADE"))]
-KeyId = Annotated[str, mapped_column(String(16))]
 Mac = Annotated[bytes, mapped_column(LargeBinary(32))]
 Sealed = Annotated[
     bytes, mapped_column(deferred=True, deferred_group="sealed", deferred_raiseload=True)
@@ -93,7 +91,6 @@ class TenantRow(Base):
     id: Mapped[RowId]
     name: Mapped[str] = mapped_column(String(64), unique=True)
     rotation_epoch: Mapped[int]
-    created_at: Mapped[datetime]
     template_enrollment: Mapped[bool] = mapped_column(server_default=false())
 
 
@@ -105,8 +102,6 @@ class RotationKeyRow(Base):
     tenant_id: Mapped[TenantId] = mapped_column(primary_key=True)
     epoch: Mapped[int] = mapped_column(primary_key=True)
     wrapped_key: Mapped[bytes]
-    wrapping_key: Mapped[KeyId]
-    created_at: Mapped[datetime]
 
 
 class ApiKeyRow(Base):
@@ -123,7 +118,6 @@ class ApiKeyRow(Base):
     created_at: Mapped[datetime]
     expires_at: Mapped[datetime | None]
     revoked_at: Mapped[datetime | None]
-    last_used_at: Mapped[datetime | None]
     lowest_level: Mapped[str | None] = mapped_column(String(64))
     mac: Mapped[Mac]
 
@@ -138,7 +132,6 @@ class SubjectRow(Base):
     __tablename__ = "subjects"
     __table_args__ = (
         UniqueConstraint("tenant_id", "subject_id"),
-        Index("ix_subjects_wrapping_key", "wrapping_key"),
         Index("ix_subjects_updated_at", "updated_at"),
     )
 
@@ -148,16 +141,12 @@ class SubjectRow(Base):
     template_id: Mapped[str] = mapped_column(String(64))
     contract_id: Mapped[str] = mapped_column(String(64))
     rotation_epoch: Mapped[int]
-    n: Mapped[int]
-    m: Mapped[int]
-    dtype: Mapped[str] = mapped_column(String(16))
     source: Mapped[Source] = mapped_column(Enum(Source, native_enum=False, length=16))
     photos: Mapped[int]
     holder_salt: Mapped[str | None] = mapped_column(UUID_HEX)
     created_at: Mapped[datetime]
     updated_at: Mapped[datetime]
     last_used_at: Mapped[datetime | None]
-    wrapping_key: Mapped[KeyId]
     wrapped_key: Mapped[Sealed]
     ciphertext: Mapped[Sealed]
 
@@ -173,7 +162,6 @@ class FailedAttemptsRow(Base):
     tenant_id: Mapped[TenantId] = mapped_column(primary_key=True)
     pseudonym: Mapped[str] = mapped_column(PSEUDONYM, primary_key=True)
     consecutive: Mapped[int]
-    total: Mapped[int]
     last_failed_at: Mapped[datetime] = mapped_column(index=True)
 
 
@@ -187,7 +175,6 @@ class ReceiptRow(Base):
     pseudonym: Mapped[str] = mapped_column(PSEUDONYM)
     body: Mapped[str] = mapped_column(Text)
     signature: Mapped[bytes] = mapped_column(LargeBinary(64))
-    created_at: Mapped[datetime]
 
 
 class AuditRow(Base):
@@ -240,5 +227,3 @@ class SecretRow(Base):
 
     name: Mapped[str] = mapped_column(String(64), primary_key=True)
     wrapped_key: Mapped[bytes]
-    wrapping_key: Mapped[KeyId]
-    created_at: Mapped[datetime]

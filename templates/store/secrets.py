@@ -7,9 +7,8 @@ import sqlalchemy as sa
 from sqlalchemy.orm import Session
 
 from templates.errors import SealError, StoreError
-from templates.keys.sealing import MasterKeyring, sealed_key_id
+from templates.keys.sealing import MasterKeyring
 from templates.store.database import Database
-from templates.store.identifiers import Clock
 from templates.store.schema import SecretRow
 
 SECRET_PURPOSE = "store-secret"  # noqa: S105 - a label, not a secret
@@ -30,10 +29,9 @@ class SecretName(StrEnum):
 class Secrets:
     """The secrets of a deployment, opened at the first use and kept in memory."""
 
-    def __init__(self, database: Database, keyring: MasterKeyring, clock: Clock) -> None:
+    def __init__(self, database: Database, keyring: MasterKeyring) -> None:
         self._database = database
         self._keyring = keyring
-        self._clock = clock
         self._opened: dict[str, bytes] = {}
 
     def get(self, name: SecretName) -> bytes:
@@ -73,10 +71,5 @@ class Secrets:
         """
         secret = os.urandom(SECRET_BYTES)
         sealed = self._keyring.seal(secret, purpose=SECRET_PURPOSE, bound_to=[name])
-        row = SecretRow(name=name, wrapped_key=sealed, created_at=self._clock())
-        row.wrapping_key = sealed_key_id(sealed)
-        session.merge(row)
+        session.merge(SecretRow(name=name, wrapped_key=sealed))
         return secret
-
-    def __repr__(self) -> str:
-        return "Secrets()"

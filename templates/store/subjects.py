@@ -29,23 +29,12 @@ _CURSOR_PURPOSE = "list-cursor"
 
 
 class EnrollmentConflict(StoreError):
-    """The subject has another template than a write may replace; it is left as it was.
-
-    Attributes
-    ----------
-    template_id
-        The template that the subject has; None if it is not enrolled.
-    """
-
-    template_id: str | None = None
+    """The subject has another template than a write may replace, `template_id`, or has none."""
 
     def __init__(self, template_id: str | None) -> None:
         super().__init__(
-            "the subject is not enrolled, and there is nothing to replace: enroll it without "
-            "naming a template"
-            if template_id is None
-            else "the subject is enrolled, with another template than the request may replace: "
-            "name that one, or choose another subject id"
+            "the subject has another template than the request may replace, or has none: name the "
+            "one that it has, name none to enroll it, or choose another subject id"
         )
         self.template_id = template_id
 
@@ -104,9 +93,6 @@ class Subjects:
         wire: bytes,
         *,
         contract_id: str,
-        n: int,
-        m: int,
-        dtype: str,
         source: Source,
         photos: int,
         template_id: str,
@@ -123,7 +109,7 @@ class Subjects:
         ----------
         wire
             The template's wire bytes.
-        contract_id, n, m, dtype, source, photos
+        contract_id, source, photos
             Metadata that stays readable without a key.
         template_id
             Random, and another one for each enrollment: the template's rotation is derived from it.
@@ -167,7 +153,6 @@ class Subjects:
             subject.template_id = template_id
             subject.contract_id = contract_id
             subject.rotation_epoch = owner.rotation_epoch
-            subject.n, subject.m, subject.dtype = n, m, dtype
             subject.source, subject.photos = source, photos
             subject.holder_salt = holder_salt
             subject.updated_at = now

@@ -8,13 +8,11 @@ enrollment that was under way, cannot mistake one for the other.
 import os
 import uuid
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 
 import sqlalchemy as sa
 from sqlalchemy.orm import Session
 
 from templates.errors import StoreError
-from templates.keys.sealing import sealed_key_id
 from templates.store.audit_log import PROGRAM, By, Entry
 from templates.store.context import StoreContext
 from templates.store.identifiers import UnknownTenant, checked_tenant_name
@@ -22,14 +20,6 @@ from templates.store.receipts import latest_receipt, tenant_receipt_name, verify
 from templates.store.schema import RotationKeyRow, TenantRow
 
 ROTATION_PURPOSE = "tenant-rotation-key"
-
-
-@dataclass(frozen=True)
-class RotationKey:
-    """The secret that a tenant's rotations derive from (``templates.keys.rotation``)."""
-
-    epoch: int
-    key: bytes = field(repr=False)
 
 
 class RetiredRotation(UnknownTenant):
@@ -52,7 +42,6 @@ class Tenants:
                     id=uuid.uuid4().hex,
                     name=name,
                     rotation_epoch=1 + self._last_epoch_of_erased(session, name),
-                    created_at=self._context.clock(),
                     template_enrollment=False,
                 )
                 session.add(tenant)
@@ -77,21 +66,19 @@ class Tenants:
             tenant_of(session, name).template_enrollment = allowed
             self._context.audit_log.append(session, Entry("tenant-settings", outcome, by, name))
 
-    def rotation_key(self, name: str, *, epoch: int | None = None) -> RotationKey:
-        """Return the key of a tenant's epoch, by default of the current one.
+    def rotation_key(self, name: str, epoch: int) -> bytes:
+        """Return the secret that the rotations of a tenant's epoch derive from.
 
         :class:`RetiredRotation` where the epoch has none any more.
         """
         with self._context.database.read() as session:
             tenant = tenant_of(session, name)
-            epoch = tenant.rotation_epoch if epoch is None else epoch
             row = session.get(RotationKeyRow, (tenant.id, epoch))
         if row is None:
             raise RetiredRotation(f"tenant {name!r} has no rotation key of epoch {epoch}")
-        key = self._context.keyring.open(
+        return self._context.keyring.open(
             row.wrapped_key, purpose=ROTATION_PURPOSE, bound_to=[tenant.id, epoch]
         )
-        return RotationKey(epoch=epoch, key=key)
 
     def add_rotation_key(self, session: Session, tenant: TenantRow) -> None:
         """Draw the key of a tenant's current epoch, a new one, in a write."""
@@ -99,15 +86,7 @@ class Tenants:
         wrapped = self._context.keyring.seal(
             os.urandom(32), purpose=ROTATION_PURPOSE, bound_to=[tenant.id, epoch]
         )
-        session.add(
-            RotationKeyRow(
-                tenant_id=tenant.id,
-                epoch=epoch,
-                wrapped_key=wrapped,
-                wrapping_key=sealed_key_id(wrapped),
-                created_at=self._context.clock(),
-            )
-        )
+        session.add(RotationKeyRow(tenant_id=tenant.id, epoch=epoch, wrapped_key=wrapped))
 
     def _last_epoch_of_erased(self, session: Session, name: str) -> int:
         """Last epoch of the latest tenant of this name that was erased, by its receipt; else 0."""
@@ -124,7 +103,7 @@ def tenant_of(session: Session, name: str) -> TenantRow:
     """Read a tenant, or raise :class:`UnknownTenant`."""
     tenant = session.scalars(_OF_NAME, {"name": name}).one_or_none()
     if tenant is None:
-        raise UnknownTenant.of_name(name)
+        raise UnknownTenant(f"there is no tenant {name!r}")
     return tenant
 
 

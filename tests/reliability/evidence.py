@@ -19,7 +19,7 @@ from api.service.opening import open_keyring, open_store
 from api.settings import DEFAULT_TENANT
 from templates.contract import wire
 from templates.errors import VeilfaceError
-from templates.store import TemplateStore
+from templates.store import TemplateStore, verify_audit_log
 from templates.store.audit_log import Line
 from templates.store.receipts import Receipt, verify_receipt
 from templates.store.schema import ReceiptRow
@@ -154,7 +154,7 @@ class _Examination:
         self.violations.append(what)
 
     def _chain(self) -> None:
-        verification = self.store.verify_audit_log()
+        verification = verify_audit_log(self.store)
         if (problem := verification.problem) is not None:
             self._wrong(f"audit log: line {problem.sequence}: {problem.what}")
         for record in verification.records:
@@ -263,18 +263,17 @@ class _Examination:
 
     def _counted(self, subject: str) -> None:
         """The failed attempts are those of the audit log."""
-        counted: tuple[int, int] | None = None
+        counted: int | None = None
         for line in self._lines_of(subject):
-            consecutive, total = counted or (0, 0)
             match line.action, line.outcome:
                 case "erase", _:
                     counted = None
                 case "verify", "reject":
-                    counted = (consecutive + 1, total + 1)
+                    counted = (counted or 0) + 1
                 case "verify", "accept":
-                    counted = None if counted is None else (0, total)
+                    counted = None if counted is None else 0
         status = self.store.attempts.status(self.tenant, subject)
-        counts = None if status is None else (status.consecutive, status.total)
+        counts = None if status is None else status.consecutive
         if counts != counted:
             self._wrong(f"{subject}: failed attempts are {counts}, by the audit log {counted}")
 

@@ -134,7 +134,7 @@ def keeps_what_was_erased(stopped: StoppedDeployment) -> None:
     with stopped.store() as store:
         other = store.subjects.get("default", "subject-0")
         assert other is not None
-        columns = ("contract_id", "n", "m", "dtype", "source", "photos", "template_id")
+        columns = ("contract_id", "source", "photos", "template_id")
         known = {name: getattr(other.record, name) for name in columns}
         store.subjects.put("default", "subject-1", other.wire, **known)
 
@@ -163,7 +163,7 @@ def forgets_a_token(stopped: StoppedDeployment) -> None:
 
 
 def lowers_a_count(stopped: StoppedDeployment) -> None:
-    stopped.execute("UPDATE failed_attempts SET consecutive = 0, total = 0")
+    stopped.execute("UPDATE failed_attempts SET consecutive = 0")
 
 
 def counts_wrongly(stopped: StoppedDeployment) -> None:

@@ -59,7 +59,7 @@ class Thief:
         """The template, turned back."""
         found = self.store.subjects.get("default", subject)
         assert found is not None
-        key = self.store.tenants.rotation_key("default", epoch=found.record.rotation_epoch).key
+        key = self.store.tenants.rotation_key("default", found.record.rotation_epoch)
         rotation = TenantRotation(key, AXES).of(found.template_id)
         return wire.decode(found.wire).subspace.turned_by(rotation.turned_back)
 
@@ -244,7 +244,7 @@ def test_the_drill(tmp_path: Path) -> None:
     )
     for read in (
         lambda: second.subjects.get("default", "alice"),
-        lambda: second.tenants.rotation_key("default"),
+        lambda: second.tenants.rotation_key("default", 2),
         second.audit_log.head,
     ):
         with pytest.raises(SealError):

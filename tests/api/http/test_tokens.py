@@ -23,6 +23,7 @@ from api.http.schemas import (
 from api.http.tokens import SubjectToken, new_token
 from api.service.opening import open_keyring, open_store
 from templates.keys.holder_key import decode_holder_key
+from templates.store import archive_audit_log
 from templates.store.audit_archive import TOKENS_LAST
 from templates.store.lockout import Replayed
 from tests.api.calls import b64, probe
@@ -169,7 +170,7 @@ def test_an_archive_does_not_make_a_used_token_good_again(service: Service, tmp_
     store = open_store(deployment.settings, open_keyring(deployment.settings))
     try:
         use = store.audit_log.head().sequence
-        moved = store.archive_audit_log(tmp_path / "archive", through=None)
+        moved = archive_audit_log(store, tmp_path / "archive", through=None)
         assert moved.last.sequence == use - 1
     finally:
         store.close()

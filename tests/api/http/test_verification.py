@@ -10,6 +10,7 @@ from api.http.schemas import VerifyAnswer
 from templates.contract import wire
 from templates.keys.sealing import MasterKeyring
 from templates.space.subspace import SubspaceBatch
+from templates.store import rewrap_keys
 from tests.api.calls import ask, b64, embedding, probe
 from tests.api.client import Client
 from tests.api.deployment import AXES, PROBE_M, Deployment, N, bearer, deploy, images, photo
@@ -251,7 +252,7 @@ def test_a_retired_master_key_does_not_tell_who_is_enrolled(tmp_path: Path) -> N
         assert client.put("/v1/subjects/a/enrollment", files=images(photo(1))).status_code == 201
         path = own.settings.resolved_master_key_file
         current = MasterKeyring.add_current(path)
-        client.app.state.runtime.store.wrapped_keys.rewrap()
+        rewrap_keys(client.app.state.runtime.store)
         MasterKeyring.drop_retired(path, keep=current)
         token = own.key("verify")
         for subject, decision in (("a", "accept"), ("nobody", "reject")):

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from templates.store import verify_audit_log
 from templates.store.database import Database
 from tests.api.calls import attempt, enroll
 from tests.api.client import Client
@@ -37,9 +38,9 @@ def test_a_token_whose_use_was_forgotten_is_taken_again_and_reported(
     token = client.post("/v1/tokens", json=asked).json()["token"]
     assert attempt(client, token, 1).status_code == 200
     assert_error(attempt(client, token, 1), 401, "replayed")
-    assert client.app.state.runtime.store.verify_audit_log().problem is None
+    assert verify_audit_log(client.app.state.runtime.store).problem is None
     run("UPDATE audit_log SET token = NULL")
     assert attempt(client, token, 1).status_code == 200
-    problem = client.app.state.runtime.store.verify_audit_log().problem
+    problem = verify_audit_log(client.app.state.runtime.store).problem
     assert problem is not None
     assert problem.what == "altered"

@@ -94,28 +94,6 @@ def test_expiry_and_revocation(store: TemplateStore, clock: Clock) -> None:
     assert listed[long.key.prefix].revoked_at == clock.time
 
 
-def test_use_is_noted_to_the_minute(store: TemplateStore, clock: Clock) -> None:
-    new = store.api_keys.create("default", [Right.VERIFY])
-
-    def last_used_after(**passed: float) -> float | None:
-        clock.pass_by(**passed)
-        store.api_keys.verify(new.token)
-        (key,) = store.api_keys.all()
-        assert key.last_used_at is not None
-        return (key.last_used_at - new.key.created_at).total_seconds()
-
-    assert last_used_after(seconds=5) == 5
-    assert last_used_after(seconds=50) == 5
-    assert last_used_after(seconds=30) == 85
-
-
-def test_keys_are_listed_by_tenant(store: TemplateStore) -> None:
-    mine = store.api_keys.create("default", [Right.VERIFY])
-    theirs = store.api_keys.create("other", [Right.ADMIN])
-    assert [key.prefix for key in store.api_keys.all(tenant="other")] == [theirs.key.prefix]
-    assert {key.prefix for key in store.api_keys.all()} == {mine.key.prefix, theirs.key.prefix}
-
-
 def test_nonsense_is_refused(store: TemplateStore) -> None:
     with pytest.raises(UnknownTenant):
         store.api_keys.create("nobody", [Right.VERIFY])
@@ -126,15 +104,6 @@ def test_nonsense_is_refused(store: TemplateStore) -> None:
     for label in ("x" * 129, "a\nb"):
         with pytest.raises(StoreError, match="label"):
             store.api_keys.create("default", [Right.VERIFY], label=label)
-
-
-def test_a_key_keeps_its_lowest_level(store: TemplateStore) -> None:
-    made = store.api_keys.create("default", [Right.VERIFY], lowest_level="fmr-1e-5")
-    assert made.key.lowest_level == "fmr-1e-5"
-    assert store.api_keys.create("default", [Right.VERIFY]).key.lowest_level is None
-    found = store.api_keys.verify(made.token)
-    assert found is not None
-    assert found.lowest_level == "fmr-1e-5"
     with pytest.raises(StoreError, match="name of a level"):
         store.api_keys.create("default", [Right.VERIFY], lowest_level="Not A Level")
 

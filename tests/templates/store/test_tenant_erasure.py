@@ -9,29 +9,18 @@ from templates.store import (
     Right,
     TemplateStore,
     UnknownTenant,
+    verify_audit_log,
     verify_receipt,
 )
 from templates.store.schema import (
-    ApiKeyRow,
     Base,
-    FailedAttemptsRow,
     ReceiptRow,
-    RotationKeyRow,
-    SubjectRow,
-    TenantRow,
 )
 from tests.databases import execute
-from tests.templates.store.conftest import Clock, count, put
+from tests.templates.store.conftest import Clock, put
 from tests.templates.store.test_attempts import attempt
 
 OPERATOR = By("operator:kim", "request-1")
-OF_A_TENANT = (
-    SubjectRow,
-    RotationKeyRow,
-    ApiKeyRow,
-    FailedAttemptsRow,
-    TenantRow,
-)
 
 
 def fill(store: TemplateStore, tenant: str, *, subjects: int = 5) -> dict[str, int]:
@@ -75,15 +64,12 @@ def test_everything_of_the_tenant_goes_and_nothing_of_another(
     assert (claims["tenant"], claims["held"], claims["version"]) == ("default", True, 1)
     assert claims["erased_at"] == clock.time.isoformat()
     assert "subject" not in claims
-    assert erasure.receipt.held
-    left = {table: count(store, table) for table in OF_A_TENANT}
-    assert left == {
-        SubjectRow: theirs["subjects"],
-        RotationKeyRow: theirs["rotation_keys"],
-        ApiKeyRow: theirs["api_keys"],
-        FailedAttemptsRow: theirs["failed_attempts"],
-        TenantRow: 1,
-    }
+    assert erasure.receipt.claims["held"]
+    of_tenants = [table for table in Base.metadata.tables.values() if "tenant_id" in table.c]
+    left = {table.name: execute(store.database, sa.select(table)) for table in of_tenants}
+    # A table that is added, with rows of a tenant, has to be filled by `fill`.
+    assert {name: len(rows) for name, rows in left.items()}.items() <= theirs.items()
+    assert [tenant.name for tenant in store.tenants.all()] == ["other"]
     with pytest.raises(UnknownTenant):
         store.tenants.get("default")
     assert store.subjects.list("default").records == []
@@ -92,7 +78,7 @@ def test_everything_of_the_tenant_goes_and_nothing_of_another(
     assert outcomes(store) == ["erased"]
     line = list(store.audit_log.lines())[-1]
     assert (line.tenant, line.actor, line.request_id) == ("default", "operator:kim", "request-1")
-    assert store.verify_audit_log().intact
+    assert verify_audit_log(store).intact
 
 
 def test_erasing_again_gives_the_same_receipt(store: TemplateStore, clock: Clock) -> None:
@@ -118,12 +104,12 @@ def test_a_tenant_that_never_was_is_unknown(store: TemplateStore) -> None:
 def test_a_tenant_made_anew_has_another_rotation_and_another_epoch(store: TemplateStore) -> None:
     """So a process that keeps rotations by name and epoch never uses the old one for it."""
     store.rerotation.begin("default")
-    old = {epoch: store.tenants.rotation_key("default", epoch=epoch).key for epoch in (1, 2)}
+    old = [store.tenants.rotation_key("default", epoch) for epoch in (1, 2)]
     first = store.erasures.erase_tenant("default")
     assert first.receipt.claims["rotation_epoch"] == 2
     tenant = store.tenants.create("default")
     assert tenant.rotation_epoch == 3
-    assert store.tenants.rotation_key("default").key not in old.values()
+    assert store.tenants.rotation_key("default", 3) not in old
     put(store, "ada", b"wire")
     second = store.erasures.erase_tenant("default")
     assert second.erased
@@ -140,23 +126,3 @@ def test_a_forged_receipt_sets_no_epoch(store: TemplateStore) -> None:
     execute(store.database, sa.update(ReceiptRow).values(body=forged))
     with pytest.raises(StoreError, match="signature"):
         store.tenants.create("default")
-
-
-def test_every_table_of_a_tenant_is_known() -> None:
-    """A table that is added with rows of a tenant must be added to its erasure as well."""
-    of_tenant = {"tenants"}
-    while (
-        more := {
-            table.name
-            for table in Base.metadata.tables.values()
-            if {key.column.table.name for key in table.foreign_keys} & of_tenant
-        }
-        - of_tenant
-    ):
-        of_tenant |= more
-    assert of_tenant == {table.__tablename__ for table in OF_A_TENANT}
-    # The rest name a tenant at most by its name: receipts and the audit log, which stay.
-    columns = {
-        table.name for table in Base.metadata.tables.values() if "tenant_id" in table.columns
-    }
-    assert columns == of_tenant - {"tenants"}

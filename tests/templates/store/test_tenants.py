@@ -1,7 +1,6 @@
 import pytest
 
 from templates.store import InvalidIdentifier, TemplateStore, UnknownTenant
-from templates.store.secrets import SecretName
 
 
 def test_a_tenant_is_made_once(store: TemplateStore) -> None:
@@ -20,23 +19,7 @@ def test_an_unknown_tenant_is_said(store: TemplateStore) -> None:
     with pytest.raises(UnknownTenant, match="'nobody'"):
         store.tenants.get("nobody")
     with pytest.raises(UnknownTenant, match="epoch 2"):
-        store.tenants.rotation_key("default", epoch=2)
-
-
-def test_each_tenant_has_a_rotation_key_of_its_own(store: TemplateStore) -> None:
-    mine, theirs = store.tenants.rotation_key("default"), store.tenants.rotation_key("other")
-    assert len(mine.key) == 32
-    assert mine.key != theirs.key
-    assert mine == store.tenants.rotation_key("default", epoch=1)
-    assert repr(mine) == "RotationKey(epoch=1)"
-
-
-def test_secrets_are_made_once_and_differ_by_name(store: TemplateStore) -> None:
-    secrets = [store.secrets.get(name) for name in SecretName]
-    assert [len(secret) for secret in secrets] == [32] * len(SecretName)
-    assert len(set(secrets)) == len(SecretName)
-    assert secrets == [store.secrets.get(name) for name in SecretName]
-    assert not any(secret.hex() in repr(store.secrets) for secret in secrets)
+        store.tenants.rotation_key("default", 2)
 
 
 def test_enrollment_by_template_is_off_until_it_is_allowed(store: TemplateStore) -> None:
