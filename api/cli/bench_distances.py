@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 
 from api.cli.bulk import listed_numbers
 from api.cli.console import progress
+from api.cli.errors import require_extra
 from api.cli.options import PROCESSOR, Device, reports, torch_device
 from api.cli.results import Result
 from api.settings import processors
-from templates.distances import Metric, Probes, on_device, pairwise_distances, warm_up
+from templates.distances import Metric, Probes, on_device, pairwise_distances
 from templates.keys.randomness import Keystream
 from templates.space.subspace import SubspaceBatch
 
@@ -63,7 +64,7 @@ def distances(
     cells = list(product(sizes, dims, ("p2s", "s2s"), Metric))
     on = torch_device(device)
     if on is None:
-        warm_up()
+        require_extra("evaluate")
     rows = []
     with progress("measuring", len(cells)) as advance, on_device(on):
         for size, m, mode, metric in cells:

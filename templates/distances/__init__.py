@@ -40,7 +40,6 @@ __all__ = [
     "pairwise_distances",
     "require_device",
     "similarity",
-    "warm_up",
 ]
 
 # Pairs that NumPy computes sooner than compiled loops are loaded: what a service compares.
@@ -179,20 +178,6 @@ def paired_distances(
     return exact.pairs(
         probes, templates, every, every, metric=Metric(metric), steps=steps, as_stored=as_stored
     ).astype(np.float32)
-
-
-def warm_up() -> None:
-    """Compile the loops of the extra ``evaluate``, or load them; a TemplateError without numba."""
-    compiled = _compiled()
-    if compiled is None:
-        raise TemplateError(
-            'numba is not installed, and fast distances need it: pip install "veilface[evaluate]"'
-        )
-    axes = np.eye(3, dtype=np.float32)
-    batch = SubspaceBatch(0.5 * axes[:1], axes[None, 1:2])
-    for metric in Metric:
-        for probes in (axes, batch):
-            list(compiled.tiles(probes, batch, metric=metric, steps=2))
 
 
 def _tiles(probes: Probes, templates: SubspaceBatch, metric: Metric, steps: int) -> Iterator[Tile]:

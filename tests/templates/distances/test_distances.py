@@ -34,7 +34,6 @@ from tests.templates.distances.batches import (
     matrix,
     pairs,
     randoms,
-    through,
     units,
 )
 
@@ -124,21 +123,6 @@ def test_points_agree_with_brute_force(metric: str, name: str):
     assert expected.min() < 0.02
     rtol, atol = (1e-6, 5e-7) if name == "exact" else (2e-5, 2e-6)
     np.testing.assert_allclose(seen, expected, rtol=rtol, atol=atol)
-
-
-@pytest.mark.parametrize("name", BACKENDS)
-@pytest.mark.parametrize("metric", METRICS)
-def test_a_member_is_at_distance_zero(metric: str, name: str):
-    stream = Keystream.seeded("members")
-    members = units(stream, 9)
-    template = SubspaceBatch.of([through(members)])
-    seen = matrix(name, members, template, metric=metric)
-    assert (seen >= 0).all()
-    assert seen.max() < 1e-6
-    probes = lift(members, strategy="random", m=4, stream=stream)
-    seen = matrix(name, probes, template, metric=metric)
-    assert (seen >= 0).all()
-    assert seen.max() < (1e-6 if metric == "euclidean" else 2e-4)
 
 
 # --- the two in float32 against float64 --------------------------------------------------------

@@ -1,8 +1,6 @@
 """The nearest of a matrix that nobody holds; and which file computes it."""
 
-import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,12 +14,8 @@ from templates.distances import (
     on_device,
     paired_distances,
     pairwise_distances,
-    warm_up,
 )
-from templates.errors import TemplateError
 from templates.keys.randomness import Keystream
-from templates.space.lifting import lift
-from tests.patience import PATIENCE_S
 from tests.templates.distances.batches import (
     BACKENDS,
     METRICS,
@@ -113,8 +107,6 @@ def test_few_pairs_are_left_to_numpy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr(distances, "compiled")
     pairwise_distances(points, templates, metric="spherical")
     assert used == ["exact", "compiled", "exact"]
-    with pytest.raises(TemplateError, match=r"veilface\[evaluate\]"):
-        warm_up()
 
 
 @pytest.mark.parametrize("metric", METRICS)
@@ -137,14 +129,6 @@ def test_a_device_holds_for_its_block_alone(metric: str, monkeypatch: pytest.Mon
     np.testing.assert_allclose(there, here, atol=2e-5)
 
 
-def test_a_device_that_is_not_there_is_refused() -> None:
-    backend("torch")
-    rows = np.eye(24)[:4]
-    templates = lift(rows, strategy="random", m=2)
-    with pytest.raises(TemplateError, match="cannot use the device nowhere"), on_device("nowhere"):
-        pairwise_distances(rows, templates, metric="euclidean")
-
-
 def test_products_on_a_device_are_float32_and_the_setting_is_restored() -> None:
     made, _ = backend("torch")
     import torch
@@ -157,65 +141,3 @@ def test_products_on_a_device_are_float32_and_the_setting_is_restored() -> None:
         assert torch.get_float32_matmul_precision() == "high"
     finally:
         torch.set_float32_matmul_precision("highest")
-
-
-_NOTHING_COMPILED = """
-import numpy as np
-from numba.core import event
-from templates import distances
-from templates.distances import compiled, warm_up
-from templates.space.lifting import lift
-
-warm_up()
-names = []
-
-class Listener(event.Listener):
-    def on_start(self, event):
-        names.append(event.data["dispatcher"].__name__)
-
-    def on_end(self, event):
-        pass
-
-event.register("numba:compile", Listener())
-distances._FEW = 0
-rows = np.linalg.qr(np.random.default_rng(0).normal(size=(64, 64)))[0]
-for m, k in ((1, 1), (2, 9), (16, 16), (20, 7)):
-    a, b = (lift(rows, strategy="random", m=dim) for dim in (m, k))
-    for metric in ("euclidean", "spherical"):
-        for probes in (a, a[::2], rows, rows.astype(np.float32), rows.astype(np.float32)[::2]):
-            distances.pairwise_distances(probes, b, metric=metric)
-print(names)
-"""
-
-
-def test_nothing_is_compiled_after_the_warm_up() -> None:
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", _NOTHING_COMPILED],
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE_S,
-        cwd=Path(__file__).resolve().parents[3],
-    )
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.strip() == "[]"
-
-
-def test_the_specification_needs_numpy_alone() -> None:
-    script = (
-        "import sys, numpy as np\n"
-        "from templates.distances import pairwise_distances\n"
-        "from templates.space.subspace import SubspaceBatch\n"
-        "axes = np.eye(6)\n"
-        "batch = SubspaceBatch(0.5 * axes[:1], axes[None, 1:3])\n"
-        "for probes in (axes, batch):\n"
-        "    pairwise_distances(probes, batch, metric='spherical')\n"
-        "print(sorted({'numba', 'torch', 'llvmlite'} & set(sys.modules)))\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", script],
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE_S,
-        cwd=Path(__file__).resolve().parents[3],
-    )
-    assert done.stdout.strip() == "[]", done.stderr

@@ -25,6 +25,7 @@ STRANGER = 61234
 
 KEY = hashlib.sha256(b"a key for tests").digest()
 OTHER = hashlib.sha256(b"another key for tests").digest()
+TEXT = base64.b64encode(KEY).decode()
 
 Parts = Sequence[str | bytes | int]
 parts = st.lists(st.one_of(st.text(max_size=8), st.binary(max_size=8), st.integers()), max_size=4)
@@ -80,22 +81,20 @@ def test_any_altered_byte_is_noticed() -> None:
             keyring.open(bytes(altered), purpose="p", bound_to=["a"])
 
 
-@pytest.mark.parametrize(
-    ("purpose", "bound"), [("q", ["a"]), ("p", ["b"]), ("p", []), ("p", ["a", ""])]
-)
-def test_a_blob_opens_only_where_it_belongs(purpose: str, bound: Parts) -> None:
+def test_a_blob_opens_only_where_it_belongs() -> None:
     keyring = MasterKeyring([KEY])
     sealed = keyring.seal(b"text", purpose="p", bound_to=["a"])
+    for purpose, bound in (("q", ["a"]), ("p", ["b"]), ("p", []), ("p", ["a", ""])):
+        with pytest.raises(SealError, match="altered, or belongs elsewhere"):
+            keyring.open(sealed, purpose=purpose, bound_to=bound)
+    for length in (0, 1, OVERHEAD_BYTES - 1):
+        with pytest.raises(SealError, match="at least"):
+            keyring.open(sealed[:length], purpose="p", bound_to=["a"])
+    sealer = Sealer(keyring)
+    sealed = sealer.seal(b"rows", context="pool 1")
+    assert sealer.open(sealed, context="pool 1") == b"rows"
     with pytest.raises(SealError, match="altered, or belongs elsewhere"):
-        keyring.open(sealed, purpose=purpose, bound_to=bound)
-
-
-@pytest.mark.parametrize("length", [0, 1, OVERHEAD_BYTES - 1])
-def test_a_truncated_blob_is_refused(length: int) -> None:
-    keyring = MasterKeyring([KEY])
-    sealed = keyring.seal(b"", purpose="p", bound_to=[])[:length]
-    with pytest.raises(SealError, match="at least"):
-        keyring.open(sealed, purpose="p", bound_to=[])
+        sealer.open(sealed, context="pool 2")
 
 
 def test_an_older_key_still_opens() -> None:
@@ -113,49 +112,69 @@ def test_a_created_file_is_private_and_random(tmp_path: Path) -> None:
     assert len(base64.b64decode((tmp_path / "key").read_bytes())) == 32
     assert list(tmp_path.iterdir()) == [tmp_path / "key"]
     assert keyring.current != MasterKeyring.create(tmp_path / "key2").current
-
-
-def test_an_existing_file_is_never_overwritten(tmp_path: Path) -> None:
-    path = write(tmp_path / "key", b"precious")
+    before = (tmp_path / "key").read_bytes()
     with pytest.raises(SealError, match="exists already"):
-        MasterKeyring.create(path)
-    assert path.read_bytes() == b"precious\n"
+        MasterKeyring.create(tmp_path / "key")
+    assert (tmp_path / "key").read_bytes() == before
 
 
-@pytest.mark.parametrize("mode", [0o640, 0o604, 0o660, 0o610, 0o777])
-def test_a_file_that_others_may_use_is_refused(tmp_path: Path, mode: int) -> None:
-    path = write(tmp_path / "key", base64.b64encode(KEY), mode=mode)
-    with pytest.raises(SealError, match="chmod 600"):
-        MasterKeyring.load(path)
+BAD_KEYS = [
+    ([], "holds no key"),
+    (["not-base64!"], "not base64"),
+    ([base64.b64encode(KEY[:31]).decode()], "31 bytes"),
+    ([base64.b64encode(KEY + b"x").decode()], "33 bytes"),
+    ([TEXT, TEXT], "same key twice"),
+    ([TEXT, base64.b64encode(b"short").decode()], "key 2"),
+]
 
 
 @pytest.mark.parametrize(
     ("lines", "message"),
     [
-        ([], "holds no key"),
-        ([b"not base64!"], "not base64"),
-        ([b"\xff\xfe"], "not text"),
-        ([base64.b64encode(KEY) + b" " + base64.b64encode(OTHER)], "not base64"),
-        ([base64.b64encode(KEY[:31])], "31 bytes"),
-        ([base64.b64encode(KEY + b"x")], "33 bytes"),
-        ([base64.b64encode(KEY), base64.b64encode(KEY)], "same key twice"),
-        ([base64.b64encode(KEY), base64.b64encode(b"short")], "key 2"),
-        ([b"A" * 100_000], "more than"),
+        *BAD_KEYS,
+        (["\u00fc"], "not text"),
+        ([TEXT + " " + TEXT], "not base64"),
+        (["A" * 10**5], "more than"),
     ],
 )
-def test_a_bad_file_is_refused(tmp_path: Path, lines: list[bytes], message: str) -> None:
-    with pytest.raises(SealError, match=message):
-        MasterKeyring.load(write(tmp_path / "key", *lines))
+def test_a_bad_file_is_refused(tmp_path: Path, lines: list[str], message: str) -> None:
+    with pytest.raises(SealError, match=message) as refused:
+        MasterKeyring.load(write(tmp_path / "key", *map(str.encode, lines)))
+    assert not any(line in str(refused.value) for line in lines)
 
 
-def test_things_that_are_no_file_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(SealError, match="does not exist"):
-        MasterKeyring.load(tmp_path / "absent")
-    with pytest.raises(SealError, match="not a regular file"):
-        MasterKeyring.load(tmp_path)
+@pytest.mark.parametrize(("lines", "message"), BAD_KEYS)
+def test_bad_keys_in_the_environment_are_refused(
+    monkeypatch: pytest.MonkeyPatch, lines: list[str], message: str
+) -> None:
+    monkeypatch.setenv("VEILFACE_TEST_KEYS", ",".join(lines))
+    with pytest.raises(SealError, match=message) as refused:
+        MasterKeyring.from_environment("VEILFACE_TEST_KEYS")
+    assert "VEILFACE_TEST_KEYS" in str(refused.value)
+    assert not any(line in str(refused.value) for line in lines)
+
+
+@pytest.mark.parametrize("separator", ["\n", " ", ",", ", "])
+def test_keys_come_from_the_environment(monkeypatch: pytest.MonkeyPatch, separator: str) -> None:
+    with pytest.raises(SealError, match="VEILFACE_TEST_KEYS is not set"):
+        MasterKeyring.from_environment("VEILFACE_TEST_KEYS")
+    monkeypatch.setenv("VEILFACE_TEST_KEYS", TEXT + separator + base64.b64encode(OTHER).decode())
+    keyring = MasterKeyring.from_environment("VEILFACE_TEST_KEYS")
+    assert keyring.key_ids == MasterKeyring([KEY, OTHER]).key_ids
+
+
+def test_things_that_are_no_file_of_ones_own_are_refused(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe", 0o600)
-    with pytest.raises(SealError, match="not a regular file"):
-        MasterKeyring.load(tmp_path / "pipe")
+    places = [
+        (tmp_path / "absent", "does not exist"),
+        (tmp_path, "not a regular file"),
+        (tmp_path / "pipe", "not a regular file"),
+    ]
+    for mode in (0o640, 0o604, 0o660, 0o610, 0o777):
+        places.append((write(tmp_path / f"{mode}", TEXT.encode(), mode=mode), "chmod 600"))
+    for path, message in places:
+        with pytest.raises(SealError, match=message):
+            MasterKeyring.load(path)
 
 
 def test_rotating_the_file_is_followed_while_running(tmp_path: Path) -> None:
@@ -242,90 +261,32 @@ def test_keys_do_not_show(tmp_path: Path) -> None:
         pickle.dumps(keyring)
 
 
-def test_a_bad_key_is_not_quoted_in_the_error(tmp_path: Path) -> None:
-    text = b"correct horse battery staple"
-    with pytest.raises(SealError) as caught:
-        MasterKeyring.load(write(tmp_path / "key", base64.b64encode(text)))
-    assert "correct" not in str(caught.value)
-    assert base64.b64encode(text).decode() not in str(caught.value)
-
-
-def test_the_sealer_binds_its_context() -> None:
-    sealer = Sealer(MasterKeyring([KEY]))
-    sealed = sealer.seal(b"rows", context="pool 1")
-    assert sealer.open(sealed, context="pool 1") == b"rows"
-    for other, context in (
-        (sealer, "pool 2"),
-        (Sealer(MasterKeyring([OTHER])), "pool 1"),
-    ):
-        with pytest.raises(SealError):
-            other.open(sealed, context=context)
-
-
-def lines_of(*keys: bytes) -> str:
-    return "".join(base64.b64encode(key).decode() + "\n" for key in keys)
-
-
-@pytest.mark.parametrize("separator", ["\n", " ", ",", ", "])
-def test_keys_come_from_the_environment(monkeypatch: pytest.MonkeyPatch, separator: str) -> None:
-    encoded = lines_of(KEY, OTHER).split()
-    monkeypatch.setenv("VEILFACE_TEST_KEYS", separator.join(encoded))
-    keyring = MasterKeyring.from_environment("VEILFACE_TEST_KEYS")
-    assert keyring.key_ids == MasterKeyring([KEY, OTHER]).key_ids
-    sealed = MasterKeyring([OTHER]).seal(b"text", purpose="p", bound_to=[])
-    assert keyring.open(sealed, purpose="p", bound_to=[]) == b"text"
-
-
+@as_root
 @pytest.mark.parametrize(
-    ("text", "message"),
-    [("", "holds no key"), (lines_of(KEY, OTHER[:31]), "key 2 .* 31 bytes")],
+    ("mode", "folder_mode", "named", "taken"),
+    [
+        (0o440, 0o700, "credentials", True),
+        (0o444, 0o700, "credentials", False),  # others may read
+        (0o440, 0o770, "credentials", False),  # others may write there
+        (0o440, 0o700, ".", False),  # elsewhere
+    ],
 )
-def test_bad_keys_in_the_environment_are_refused(
-    monkeypatch: pytest.MonkeyPatch, text: str, message: str
+def test_a_credential_of_systemd_is_taken_and_nothing_that_only_looks_like_one(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    mode: int,
+    folder_mode: int,
+    named: str,
+    taken: bool,
 ) -> None:
-    monkeypatch.setenv("VEILFACE_TEST_KEYS", text)
-    with pytest.raises(SealError, match=message) as caught:
-        MasterKeyring.from_environment("VEILFACE_TEST_KEYS")
-    assert "VEILFACE_TEST_KEYS" in str(caught.value)
-    assert not any(line in str(caught.value) for line in text.split())
-
-
-def test_an_unset_variable_is_named() -> None:
-    with pytest.raises(SealError, match="VEILFACE_TEST_KEYS is not set"):
-        MasterKeyring.from_environment("VEILFACE_TEST_KEYS")
-
-
-# --- credentials of systemd ----------------------------------------------------------------
-
-
-@pytest.fixture
-def credential(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A key file as systemd hands one over: root's, with the group's bit as a list makes it."""
-    if os.geteuid() != 0:
-        pytest.skip("a credential is root's file")
-    folder = tmp_path / "credentials"
-    folder.mkdir(mode=0o700)
-    monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(folder))
-    file = folder / "master.key"
-    MasterKeyring.create(file)
-    file.chmod(0o440)
-    return file
-
-
-def test_a_credential_of_systemd_is_taken(credential: Path) -> None:
-    assert MasterKeyring.load(credential).key_ids
-
-
-@pytest.mark.parametrize("wrong", ["others may read", "others may write there", "elsewhere"])
-def test_what_only_looks_like_a_credential_is_refused(
-    credential: Path, monkeypatch: pytest.MonkeyPatch, wrong: str
-) -> None:
-    match wrong:
-        case "others may read":
-            credential.chmod(0o444)
-        case "others may write there":
-            credential.parent.chmod(0o770)
-        case _:
-            monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(credential.parent.parent))
-    with pytest.raises(SealError, match="may be read by others"):
-        MasterKeyring.load(credential)
+    """systemd hands over root's file, with the group's bit as an access control list makes it."""
+    file = tmp_path / "credentials" / "master.key"
+    key_ids = MasterKeyring.create(file).key_ids
+    file.chmod(mode)
+    file.parent.chmod(folder_mode)
+    monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(tmp_path / named))
+    if taken:
+        assert MasterKeyring.load(file).key_ids == key_ids
+    else:
+        with pytest.raises(SealError, match="may be read by others"):
+            MasterKeyring.load(file)
