@@ -5,10 +5,9 @@ types, and Starlette writes parts over 1 MiB to a temporary file, where a face h
 be.
 """
 
-import json
 import re
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from typing import Any, TypeVar
 
 import anyio
@@ -19,15 +18,15 @@ from starlette.formparsers import MultiPartException, MultiPartParser
 from starlette.requests import Request
 
 from api.http.errors import ApiError, refuse_unknown_names, wrong_value
-from api.http.requests import Body, how_to_send
+from api.http.requests import MAX_EMBEDDING, Body, how_to_send, too_many_images
 from api.limits.admission import MAX_JSON_BYTES, read_limited, stream_limited
-from models.decoding import MAX_BYTES
-from templates.contract.canonical import too_many_parts
+from templates.contract.canonical import parse_object, too_many_parts
+from templates.errors import ContractError, InvalidEmbedding, InvalidTemplate
+from verify import MAX_PROBE_PHOTOS
 
 _FORM, _JSON = "multipart/form-data", "application/json"
 _MEDIA_TYPE = re.compile(r"[a-z0-9.+-]{1,63}/[a-z0-9.+-]{1,63}")
 MAX_REQUEST_BYTES = 32 * 2**20
-MAX_IMAGE_BYTES = MAX_BYTES
 MAX_FIELD_BYTES = 4096
 MAX_FIELDS = 16
 BODY_TIMEOUT_S = 60.0
@@ -40,7 +39,7 @@ B = TypeVar("B", bound=Body)
 
 
 class _InMemoryParser(MultiPartParser):
-    """Starlette's parser without its temporary files, with the limits of photos."""
+    """Starlette's parser without its temporary files, with a bound on photos."""
 
     # Python's SpooledTemporaryFile never moves to disk when its limit is 0.
     spool_max_size = 0
@@ -54,47 +53,26 @@ class _InMemoryParser(MultiPartParser):
             max_part_size=MAX_FIELD_BYTES,
         )
         self._most = most
-        self._image_bytes = 0
         self._complete = False
 
     def on_end(self) -> None:
         self._complete = True
 
-    async def parse(self) -> FormData:
-        try:
-            form = await super().parse()
-            if not self._complete:
-                # Otherwise a truncated form would pass with the photos that came before the cut.
-                raise MultiPartException("the last boundary is missing")
-        except BaseException:
-            for file in self._files_to_close_on_error:
-                file.close()
-            raise
-        return form
-
     def on_headers_finished(self) -> None:
         super().on_headers_finished()
-        self._image_bytes = 0
         if self._current_files > self._most:
             raise too_many_images(self._most)
 
-    def on_part_data(self, data: bytes, start: int, end: int) -> None:
-        if self._current_part.file is not None:
-            self._image_bytes += end - start
-            if self._image_bytes > MAX_IMAGE_BYTES:
-                raise ApiError(
-                    "image_too_large",
-                    f"photo {self._current_files} is larger than {MAX_IMAGE_BYTES:,} bytes: "
-                    "send a smaller copy",
-                    {"limit_bytes": MAX_IMAGE_BYTES, "image": self._current_files - 1},
-                )
-        super().on_part_data(data, start, end)
+    async def parse(self) -> FormData:
+        form = await super().parse()
+        if not self._complete:
+            # Otherwise a truncated form would pass with the photos that came before the cut.
+            raise MultiPartException("the last boundary is missing")
+        return form
 
-
-def too_many_images(most: int) -> ApiError:
-    """Refuse more photos than a call takes."""
-    photos = "photo" if most == 1 else "photos"
-    return ApiError("too_many_images", f"at most {most} {photos} in one request", {"limit": most})
+    def close(self) -> None:
+        for file in self._files_to_close_on_error:
+            file.close()
 
 
 def is_form(request: Request) -> bool:
@@ -125,9 +103,10 @@ async def read_form(request: Request, model: type[B], *, photos: str, most: int)
     `photos` names the field for photos, of which at most `most` may come.
     """
     _require_type(request, _FORM, how_to_send(photos))
-    with _arrives_within(BODY_TIMEOUT_S):
+    values: dict[str, Any] = {}
+    with _arrives_within(BODY_TIMEOUT_S), closing(_InMemoryParser(request, most)) as parser:
         try:
-            form = await _InMemoryParser(request, most).parse()
+            form = await parser.parse()
         except (MultiPartException, UnicodeError, ValueError):
             raise ApiError(
                 "malformed_request",
@@ -135,26 +114,18 @@ async def read_form(request: Request, model: type[B], *, photos: str, most: int)
                 "too many fields: let your HTTP library write both the form and its Content-Type, "
                 "which names the boundary",
             ) from None
-    values: dict[str, Any] = {}
-    try:
         for name, value in form.multi_items():
-            content = value if isinstance(value, str) else value.file.read()
-            if isinstance(content, bytes) and isinstance(values.setdefault(name, []), list):
-                values[name].append(content)
-            elif name in values:
-                raise ApiError("validation_failed", "a form field is given twice")
+            if isinstance(value, str) and name not in values:
+                values[name] = value
+            elif not isinstance(value, str) and isinstance(values.setdefault(name, []), list):
+                values[name].append(value.file.read())
             else:
-                values[name] = content
-    finally:
-        await form.close()
+                raise ApiError("validation_failed", "a form field is given twice")
     return _checked(model, values, photos)
 
 
 async def read_json(request: Request, model: type[B], *, photos: str | None = None) -> B:
-    """Read a JSON object, in UTF-8; `photos` is the multipart field, where a call takes these too.
-
-    ``NaN`` and infinities pass, so that an embedding that holds them is refused as such.
-    """
+    """Read a JSON object, in UTF-8; `photos` is the multipart field, where a call takes these."""
     how = "send JSON as application/json"
     if photos is not None:
         how = f"{how_to_send(photos)}, and what is no photo as application/json"
@@ -170,22 +141,10 @@ async def read_json(request: Request, model: type[B], *, photos: str | None = No
 
 def _parsed(model: type[B], body: bytes, photos: str | None) -> B:
     try:
-        values = json.loads(body.decode("utf-8-sig"), object_pairs_hook=_unique)
-    except (ValueError, RecursionError):
-        raise ApiError(
-            "malformed_request", "the body is not well-formed JSON in UTF-8, or names a field twice"
-        ) from None
-    if not isinstance(values, dict):
-        raise ApiError("malformed_request", "the body must be a JSON object")
+        values = parse_object(body, what="the body")
+    except ContractError as error:
+        raise ApiError("malformed_request", str(error)) from None
     return _checked(model, values, photos)
-
-
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    # Readers differ in which of two counts.
-    fields = dict(pairs)
-    if len(fields) != len(pairs):
-        raise ValueError("a field is named twice")
-    return fields
 
 
 def _checked(model: type[B], values: Mapping[str, Any], photos: str | None) -> B:
@@ -195,7 +154,17 @@ def _checked(model: type[B], values: Mapping[str, Any], photos: str | None) -> B
         return model.model_validate(values)
     except ValidationError as error:
         problem = error.errors(include_url=False, include_input=False)[0]
-        raise wrong_value(problem, remedy if problem["loc"] in ((photos,), ()) else "") from None
+    name = str(problem["loc"][0]) if problem["loc"] else None
+    if name in ("embedding", "embeddings"):
+        raise InvalidEmbedding(
+            f"an embedding is a list of 1 to {MAX_EMBEDDING} numbers, and embeddings are 1 to "
+            f"{MAX_PROBE_PHOTOS} of them"
+        )
+    if problem["type"] == "base64_decode":
+        raise InvalidTemplate(f"{name} is not base64")
+    if name == photos and problem["type"] == "too_long":
+        raise too_many_images(problem["ctx"]["max_length"])
+    raise wrong_value(problem, name, remedy if name in (photos, None) else "")
 
 
 @contextmanager

@@ -145,7 +145,8 @@ def api_error(error: Exception) -> ApiError:
     if isinstance(error, ApiError):
         return error
     if isinstance(error, RequestValidationError):
-        return wrong_value(error.errors()[0])
+        problem = error.errors()[0]
+        return wrong_value(problem, str(problem["loc"][-1]))
     if isinstance(error, HTTPException):
         code, message = _FRAMEWORK.get(error.status_code, _FRAMEWORK[400])
         return ApiError(code, message, {}, error.headers or {})
@@ -208,9 +209,8 @@ _WORDS = {
 }
 
 
-def wrong_value(problem: Mapping[str, Any], remedy: str = "") -> ApiError:
+def wrong_value(problem: Mapping[str, Any], name: str | None, remedy: str = "") -> ApiError:
     """Name the parameter or field that pydantic refused, and its bounds; never what was sent."""
-    name = str(problem["loc"][-1]) if problem["loc"] else None
     bounds = problem.get("ctx", {})
     said = [words.format(bounds[bound]) for bound, words in _WORDS.items() if bound in bounds]
     if problem["type"] == "value_error":

@@ -4,31 +4,30 @@ OpenAPI describes them as they stand here, and a body is read into one after aut
 (``api.http.bodies``). A name that a model does not have is refused. No message repeats a value.
 """
 
-import base64
-import binascii
-import json
-from collections.abc import Sequence
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import (
     AfterValidator,
+    Base64Bytes,
     BaseModel,
     ConfigDict,
     Field,
+    Json,
     PlainValidator,
     WithJsonSchema,
     model_validator,
 )
 
+from api.http.errors import ApiError
+from enroll.enroller import MAX_PHOTOS
 from models.selection import FacePolicy
-from templates.decoys import Attributes
-from templates.errors import InvalidEmbedding, InvalidTemplate, SealError
+from templates.errors import InvalidEmbedding, SealError
 from templates.keys.holder_key import PATTERN as HOLDER_KEY_PATTERN
 from templates.keys.holder_key import decode_holder_key
 from templates.store.identifiers import SUBJECT_ID_RULE, checked_subject_id
-from verify import MAX_FRAMES, MAX_PROBE_PHOTOS
+from verify import MAX_FRAMES, MAX_PROBE_PHOTOS, MIN_FRAMES
 
 MAX_EMBEDDING = 4096
 LONGEST_S = 120
@@ -38,7 +37,7 @@ LONGEST_S = 120
 class Body(BaseModel):
     """A body: strict in names and types."""
 
-    model_config = ConfigDict(extra="forbid", strict=True, arbitrary_types_allowed=True)
+    model_config = ConfigDict(extra="forbid", strict=True)
 
     def __repr__(self) -> str:
         """Name the model alone: it holds photos, embeddings and keys."""
@@ -53,15 +52,6 @@ def _printable(text: str) -> str:
     return text
 
 
-def _decoded(value: Any) -> bytes:
-    if not isinstance(value, str):
-        raise ValueError("must be a base64 string")
-    try:
-        return base64.b64decode(value, validate=True)
-    except (binascii.Error, ValueError):
-        raise InvalidTemplate("it is not base64") from None
-
-
 def _holder_key(value: Any) -> bytearray:
     try:
         return decode_holder_key(value)
@@ -69,58 +59,15 @@ def _holder_key(value: Any) -> bytearray:
         raise ValueError(f"is no holder key: {error}") from None
 
 
-def _embedding(value: Any) -> NDArray[np.float64]:
-    """Return a list of JSON numbers as (n,); the verifier checks length and norm."""
-    if not isinstance(value, list) or not 0 < len(value) <= MAX_EMBEDDING:
-        raise InvalidEmbedding(f"an embedding is a list of 1 to {MAX_EMBEDDING} numbers")
-    if not {*map(type, value)} <= {int, float}:
-        raise InvalidEmbedding("an embedding holds something that is not a number")
-    try:
-        return np.array(value, dtype=np.float64)
-    except OverflowError:
-        raise InvalidEmbedding("an embedding holds a number that is not finite") from None
-
-
-def _embeddings(value: Any) -> NDArray[np.float64]:
-    """Return 1 to 5 lists of JSON numbers as (k, n)."""
-    if not isinstance(value, list) or not 0 < len(value) <= MAX_PROBE_PHOTOS:
-        raise InvalidEmbedding(f"embeddings are a list of 1 to {MAX_PROBE_PHOTOS} lists of numbers")
-    rows = [_embedding(row) for row in value]
-    if len({len(row) for row in rows}) > 1:
-        raise InvalidEmbedding("the embeddings differ in length")
-    return np.stack(rows)
-
-
-def _attributes(value: Any) -> Attributes:
-    """Read labels for the lifting, which are forgotten after it."""
-    try:
-        labels = json.loads(value)
-        if set(labels) <= {"gender", "race"} and all(map(_is_label, labels.values())):
-            return Attributes(gender=labels.get("gender"), race=labels.get("race"))
-    except (ValueError, TypeError, AttributeError, RecursionError):
-        pass
-    raise ValueError("must be a JSON object with texts for gender and race, or one of them")
-
-
-def _is_label(value: Any) -> bool:
-    return isinstance(value, str) and 0 < len(value) <= 64 and value.isprintable()
-
-
 def how_to_send(photos: str) -> str:
     """Say how photos are sent, in a field of this name."""
     return f"send photos as files of the multipart field {photos} (curl: -F {photos}=@photo.jpg)"
 
 
-def _files(value: Any) -> Sequence[bytes]:
-    if not isinstance(value, list):
-        raise ValueError("must come as files")
-    return value
-
-
-def _photos(most: int, *, least: int = 1) -> Any:
-    """The schema of files of one field."""
-    file = {"type": "string", "format": "binary"}
-    return WithJsonSchema({"type": "array", "items": file, "minItems": least, "maxItems": most})
+def too_many_images(most: int) -> ApiError:
+    """Refuse more photos than a call takes."""
+    photos = "photo" if most == 1 else "photos"
+    return ApiError("too_many_images", f"at most {most} {photos} in one request", {"limit": most})
 
 
 Text = Annotated[str, Field(min_length=1, max_length=64), AfterValidator(_printable)]
@@ -136,7 +83,7 @@ Level = Annotated[
         examples=["fmr-1e-3"],
     ),
 ]
-Base64 = Annotated[bytes, PlainValidator(_decoded), WithJsonSchema({"type": "string"})]
+Base64 = Annotated[Base64Bytes, Field(strict=False), WithJsonSchema({"type": "string"})]
 HolderKey = Annotated[
     bytearray,
     PlainValidator(_holder_key),
@@ -149,16 +96,9 @@ HolderKey = Annotated[
         }
     ),
 ]
-_NUMBERS: dict[str, Any] = {"type": "array", "items": {"type": "number"}, "minItems": 1}
-Embedding = Annotated[NDArray[np.float64], PlainValidator(_embedding), WithJsonSchema(_NUMBERS)]
-Embeddings = Annotated[
-    NDArray[np.float64],
-    PlainValidator(_embeddings),
-    WithJsonSchema(
-        {"type": "array", "items": _NUMBERS, "minItems": 1, "maxItems": MAX_PROBE_PHOTOS}
-    ),
-]
-Photos = Annotated[Sequence[bytes], PlainValidator(_files)]
+Embedding = Annotated[list[float], Field(min_length=1, max_length=MAX_EMBEDDING)]
+Embeddings = Annotated[list[Embedding], Field(min_length=1, max_length=MAX_PROBE_PHOTOS)]
+Photos = Annotated[list[bytes], Field(min_length=1)]
 Face = Annotated[
     FacePolicy,
     Field(
@@ -174,19 +114,12 @@ Face = Annotated[
 class EnrollmentForm(Body):
     """Photos of one person."""
 
-    images: Annotated[Photos, _photos(10)]
-    attributes: Annotated[
-        Attributes,
-        PlainValidator(_attributes),
-        WithJsonSchema(
-            {
-                "type": "string",
-                "description": "JSON object with `gender` and `race`; used for lifting only, never "
-                "stored.",
-                "examples": ['{"gender": "Female", "race": "Indian"}'],
-            }
-        ),
-    ] = Attributes()
+    images: Photos = Field(max_length=MAX_PHOTOS)
+    attributes: Json[dict[Literal["gender", "race"], Text]] = Field(
+        default_factory=dict,
+        description="JSON object with `gender` and `race`; used for lifting only, never stored.",
+        examples=['{"gender": "Female", "race": "Indian"}'],
+    )
     face: Face = FacePolicy.DOMINANT
     holder_key: HolderKey | None = None
 
@@ -201,8 +134,8 @@ class EnrollmentJson(Body):
 class VerifyForm(Body):
     """Photos of one person, as `image` or as `images`."""
 
-    image: Annotated[Photos, _photos(MAX_PROBE_PHOTOS)] = ()
-    images: Annotated[Photos, _photos(MAX_FRAMES)] = ()
+    image: Photos = Field([], max_length=MAX_PROBE_PHOTOS)
+    images: Photos = Field([], max_length=MAX_FRAMES)
     challenge_id: Annotated[str, Field(min_length=1, max_length=1024)] | None = Field(
         None,
         description="`challenge_id` of POST /v1/challenges: the images are then the 5 to 12 frames "
@@ -218,14 +151,19 @@ class VerifyForm(Body):
         return "photo" if self.challenge_id is None else "frames"
 
     @property
-    def photos(self) -> Sequence[bytes]:
+    def photos(self) -> list[bytes]:
         """Under whichever name they came."""
         return self.image or self.images
 
     @model_validator(mode="after")
-    def _one_name(self) -> Self:
+    def _as_many_as_there_should_be(self) -> Self:
         if bool(self.image) == bool(self.images):
             raise ValueError(how_to_send("image"))
+        if self.challenge_id is None:
+            if len(self.photos) > MAX_PROBE_PHOTOS:
+                raise too_many_images(MAX_PROBE_PHOTOS)
+        elif len(self.photos) < MIN_FRAMES:
+            raise ValueError(f"a challenge is answered by {MIN_FRAMES} to {MAX_FRAMES} images")
         return self
 
 
@@ -248,10 +186,11 @@ class VerifyJson(Body):
 
     @property
     def rows(self) -> NDArray[np.float64]:
-        """The embeddings, (k, n)."""
-        sent = self.embedding if self.embeddings is None else self.embeddings
-        assert sent is not None  # noqa: S101 - by the validator, where there is no template
-        return np.atleast_2d(sent)
+        """The embeddings, (k, n); the verifier checks their norms."""
+        rows = self.embeddings or [self.embedding or []]
+        if len({*map(len, rows)}) > 1:
+            raise InvalidEmbedding("the embeddings differ in length")
+        return np.array(rows)
 
     @model_validator(mode="after")
     def _one_probe(self) -> Self:
@@ -264,7 +203,7 @@ class VerifyJson(Body):
 class CompareForm(Body):
     """Two photos: the first stands for an enrollment, the second for the probe."""
 
-    images: Annotated[Photos, Field(min_length=2), _photos(2, least=2)]
+    images: Annotated[list[bytes], Field(min_length=2, max_length=2)]
     level: Level | None = None
     face: Face = FacePolicy.DOMINANT
 
@@ -272,7 +211,7 @@ class CompareForm(Body):
 class PhotoCheckForm(Body):
     """One photo."""
 
-    image: Annotated[Photos, _photos(1)]
+    image: Photos = Field(max_length=1)
     face: Face = FacePolicy.DOMINANT
 
 

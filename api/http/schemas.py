@@ -13,7 +13,6 @@ from verify.challenge import LivenessFailure
 
 REQUEST_ID: ContextVar[str] = ContextVar("request_id")
 """Id of the request that is being answered, which the middleware sets."""
-HEX = "9f86d081884c7d659a2feaa0c55ad015a3bf4f1b2b0b822cd15d6c15b0f00a08"
 
 
 def iso_time(value: datetime) -> str:
@@ -21,8 +20,9 @@ def iso_time(value: datetime) -> str:
     return value.astimezone(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
 
 
-def _is_none(value: object) -> bool:
-    return value is None
+def _absent(description: str) -> Any:
+    """A field that the answer lacks where it has no value."""
+    return Field(None, description=description, exclude_if=lambda value: value is None)
 
 
 Time = Annotated[
@@ -48,8 +48,8 @@ class _Answer(_Shape):
 class ErrorBody(_Shape):
     """What went wrong."""
 
-    code: str = Field(examples=["no_face"], json_schema_extra={"enum": list(ERROR_CODES)})
-    message: str = Field(examples=["no face was found in the photo"])
+    code: str = Field(json_schema_extra={"enum": list(ERROR_CODES)})
+    message: str
     details: dict[str, Any]
 
 
@@ -68,14 +68,23 @@ class Photo(_Shape):
     quality: dict[str, float | None] = Field(description="Measures of the quality gate.")
 
 
-class EnrollmentAnswer(_Answer):
-    """The subject is enrolled."""
-
+class _EnrolledAnswer(_Answer):
     template_id: str = Field(description="Changes with every enrollment.")
-    contract_id: str = Field(examples=[HEX])
+    contract_id: str
     replaced: bool = Field(description="An earlier enrollment was replaced.")
     holder_key: bool = Field(description="It accepts nobody without the holder's key.")
+
+
+class EnrollmentAnswer(_EnrolledAnswer):
+    """The subject is enrolled."""
+
     images: list[Photo] = Field(description="One for each photo; empty for a template.")
+
+
+class ImportAnswer(_EnrolledAnswer):
+    """The subject is enrolled."""
+
+    subject_id: str
 
 
 class VerifyAnswer(_Answer):
@@ -86,28 +95,20 @@ class VerifyAnswer(_Answer):
     liveness: Literal["passed", "failed", "not_checked"] = Field(
         description="Whether a living person made the probe."
     )
-    level: str = Field(examples=["fmr-1e-3"])
-    fmr: float = Field(description="False match rate of the level.", examples=[0.001])
-    contract_id: str = Field(examples=[HEX])
-    calibration_id: str = Field(examples=[HEX])
-    distance: float | None = Field(
-        None, description="Only for keys with `scores` and `enroll`.", exclude_if=_is_none
+    level: str
+    fmr: float = Field(description="False match rate of the level.")
+    contract_id: str
+    calibration_id: str
+    distance: float | None = _absent("Only for keys with `scores` and `enroll`.")
+    distance_threshold: float | None = _absent(
+        "The largest distance at which this probe is accepted: only beside `distance`."
     )
-    distance_threshold: float | None = Field(
-        None,
-        description="The largest distance at which this probe is accepted: only beside `distance`.",
-        exclude_if=_is_none,
+    liveness_failure: LivenessFailure | None = _absent(
+        "Why liveness failed: only for keys with `scores` and `enroll`."
     )
-    liveness_failure: LivenessFailure | None = Field(
-        None,
-        description="Why liveness failed: only for keys with `scores` and `enroll`.",
-        exclude_if=_is_none,
-    )
-    advice: str | None = Field(
-        None,
-        description="What to change in another photo, after `no_match`: by the photo alone, "
-        "whether the subject is enrolled or not.",
-        exclude_if=_is_none,
+    advice: str | None = _absent(
+        "What to change in another photo, after `no_match`: by the photo alone, "
+        "whether the subject is enrolled or not."
     )
 
 
@@ -116,11 +117,10 @@ class ChallengeAnswer(_Answer):
 
     challenge_id: str
     movements: list[Movement] = Field(
-        description="In this order, as the person sees them who makes them.",
-        examples=[["turn_left", "look_up", "come_closer"]],
+        description="In this order, as the person sees them who makes them."
     )
-    min_frames: int = Field(examples=[5])
-    max_frames: int = Field(examples=[12])
+    min_frames: int
+    max_frames: int
     expires_at: Time
 
 
@@ -128,18 +128,13 @@ class TokenAnswer(_Answer):
     """A token for one call of one subject."""
 
     token: str = Field(
-        description="For the browser, as `Authorization: Bearer vft_…`. It is shown once.",
-        examples=["vft_0f3a5c7e9b1d_AR8k"],
+        description="For the browser, as `Authorization: Bearer vft_…`. It is shown once."
     )
-    token_id: str = Field(
-        description="For your server, to ask what came of it.",
-        examples=["pX3q0u5mC1oV8n2JdE7yRw4k"],
-    )
-    subject_id: str = Field(examples=["alice"])
+    token_id: str = Field(description="For your server, to ask what came of it.")
+    subject_id: str
     action: Literal["verify", "enroll"]
     level: str | None = Field(
-        description="The only level that it verifies at; null for an enrollment.",
-        examples=["fmr-1e-3"],
+        description="The only level that it verifies at; null for an enrollment."
     )
     expires_at: Time
 
@@ -154,7 +149,7 @@ class TokenOutcomeAnswer(_Answer):
     outcome: Literal["accept", "reject", "locked_out", "created", "replaced"] | None = Field(
         description="Null where it was not used."
     )
-    level: str | None = Field(description="Of a verification that used it.", examples=["fmr-1e-3"])
+    level: str | None = Field(description="Of a verification that used it.")
     used_at: Time | None
 
 
@@ -162,29 +157,29 @@ class PackFileEntry(_Shape):
     """One graph of the pack."""
 
     role: Literal["detector", "embedder"]
-    kind: str | None = Field(description="Of a detector.", examples=["scrfd", "yunet"])
-    file: str = Field(examples=["w600k_mbf.onnx"])
-    sha256: str = Field(examples=[HEX])
-    bytes: int = Field(examples=[13616099])
-    path: str = Field(description="Where it is, on this service.", examples=[f"/v1/pack/{HEX}"])
-    input_size: list[int] = Field(description="Width and height.", examples=[[112, 112]])
+    kind: str | None = Field(description="Of a detector.")
+    file: str
+    sha256: str
+    bytes: int
+    path: str = Field(description="Where it is, on this service.")
+    input_size: list[int] = Field(description="Width and height.")
 
 
 class PackAnswer(_Answer):
     """The graphs that the contract names, for clients that embed."""
 
-    name: str = Field(examples=["buffalo_sc"])
+    name: str
     licence: str | None = Field(description="What is known of a pack of this name.")
-    contract_id: str = Field(examples=[HEX])
+    contract_id: str
     files: list[PackFileEntry]
 
 
 class Subject(_Shape):
     """A subject, without its template."""
 
-    subject_id: str = Field(examples=["alice"])
+    subject_id: str
     template_id: str
-    contract_id: str = Field(examples=[HEX])
+    contract_id: str
     current: bool = Field(description="Served by the contract in force; otherwise enroll again.")
     enrolled_by: Literal["photos", "template"]
     photos: int = Field(description="Photos that were averaged; 0 for a template.")
@@ -208,11 +203,11 @@ class AuditLine(_Shape):
     """One line of the audit log: who did what to which subject, and with which result."""
 
     at: Time
-    actor: str = Field(description="Of a request, its key.", examples=["key:0f3a5c7e9b1d"])
-    action: str = Field(examples=["verify"])
-    subject: str | None = Field(description="Pseudonym of the subject.", examples=[HEX])
-    outcome: str = Field(examples=["accept"])
-    detail: str | None = Field(examples=["fmr-1e-3"])
+    actor: str = Field(description="Of a request, its key.")
+    action: str
+    subject: str | None = Field(description="Pseudonym of the subject.")
+    outcome: str
+    detail: str | None
     request_id: str | None
 
 
@@ -245,33 +240,13 @@ class SignedReceipt(_Shape):
     signature: str = Field(description="Ed25519 over the UTF-8 bytes of `body`, base64.")
 
 
-class ErasedItem(_Shape):
-    """Records of one kind that the erasure removed."""
-
-    item: Literal["template", "data_key", "metadata", "failed_attempts"]
-    count: int
-
-
-class ReceiptClaims(_Shape):
-    """What `body` says, for reading only: it is not signed in this form."""
-
-    kind: Literal["veilface-erasure-receipt"]
-    version: Literal[1]
-    receipt_id: str = Field(description="Random; no two receipts share one.")
-    tenant: str
-    subject: str = Field(description="Pseudonym: HMAC of the subject id under a secret key.")
-    erased_at: str = Field(examples=["2026-01-31T12:00:00.000000+00:00"])
-    held: bool = Field(description="False: nobody was enrolled.")
-    contract_id: str | None = Field(description="Of the template; null: none was held.")
-    erased: list[ErasedItem] = Field(description="Every kind of record, with what was removed.")
-    signing_key: str = Field(description="`receipt_key.key_id` of GET /v1/contract.")
-
-
 class ReceiptAnswer(_Answer):
     """The receipt of an erasure."""
 
     receipt: SignedReceipt
-    claims: ReceiptClaims
+    claims: dict[str, Any] = Field(
+        description="What `body` says, for reading only: it is not signed in this form."
+    )
     log_purged: bool = Field(
         description="False where a reader of SQLite's database keeps old pages in the write-ahead "
         "log just now: they go with a later purge."
@@ -282,18 +257,8 @@ class ExportAnswer(_Answer):
     """One subject, encrypted."""
 
     export: str = Field(description="Base64 of the encrypted export.")
-    contract_id: str = Field(examples=[HEX])
+    contract_id: str
     key_id: str = Field(description="Names the export key.")
-
-
-class ImportAnswer(_Answer):
-    """The subject is enrolled."""
-
-    subject_id: str
-    template_id: str
-    contract_id: str = Field(examples=[HEX])
-    replaced: bool
-    holder_key: bool = Field(description="It accepts nobody without the holder's key.")
 
 
 class ReceiptKey(_Shape):
@@ -307,7 +272,7 @@ class ReceiptKey(_Shape):
 class ContractAnswer(_Answer):
     """The contract in force: everything but what is sealed."""
 
-    contract_id: str = Field(examples=[HEX])
+    contract_id: str
     binding: dict[str, Any]
     recorded: dict[str, Any]
     calibrations: list[dict[str, Any]]
@@ -321,11 +286,9 @@ class ContractAnswer(_Answer):
         "labelled, the `groups` with their worst; each with a status, `PASS` or `FAIL`; null: not "
         "measured."
     )
-    liveness: dict[str, Any] | None = Field(
-        None,
-        description="The liveness threshold with its graphs and error rates (docs/liveness.md); "
-        "absent where there is none.",
-        exclude_if=_is_none,
+    liveness: dict[str, Any] | None = _absent(
+        "The liveness threshold with its graphs and error rates (docs/liveness.md); "
+        "absent where there is none."
     )
     photos: bool = Field(description="The service runs with a model pack.")
     generator: bool = Field(description="GET /v1/contract/generator has a generator to give.")
@@ -338,13 +301,12 @@ class ContractAnswer(_Answer):
 class KeyAnswer(_Answer):
     """The API key of the request, without its secret."""
 
-    prefix: str = Field(description="How lists and logs name the key.", examples=["0f3a5c7e9b1d"])
-    tenant: str = Field(examples=["default"])
+    prefix: str = Field(description="How lists and logs name the key.")
+    tenant: str
     rights: list[Right]
     levels: list[str] = Field(
         description="Security levels that it may ask for; not those below the lowest that the "
-        "deployment or the key allows.",
-        examples=[["fmr-1e-3", "fmr-1e-4"]],
+        "deployment or the key allows."
     )
     liveness: Literal["off", "passive", "active", "both"] = Field(
         description="What every verification must pass (docs/liveness.md)."

@@ -10,6 +10,7 @@ from api.http.requests import EnrollmentForm, EnrollmentJson
 from api.http.schemas import EnrollmentAnswer, Photo
 from enroll import Holder
 from enroll.enroller import MAX_PHOTOS
+from templates.decoys import Attributes
 from templates.keys.holder_key import wipe
 from templates.store.schema import Source
 
@@ -73,7 +74,7 @@ async def enroll(
                     enrollment = epoch.enroller.from_photos(
                         runtime.required_pack(),
                         sent.images,
-                        attributes=sent.attributes,
+                        attributes=Attributes(**sent.attributes),
                         holder=holder,
                         policy=sent.face,
                     )

@@ -24,7 +24,7 @@ from functools import cache, partial
 from fastapi import APIRouter
 
 from api.http.auth import Call, Verifies
-from api.http.bodies import is_form, read_form, read_json, too_many_images
+from api.http.bodies import is_form, read_form, read_json
 from api.http.deps import SubjectDep
 from api.http.errors import ApiError
 from api.http.openapi import body_of
@@ -38,8 +38,6 @@ from templates.keys.holder_key import wipe
 from templates.store.attempts import Attempt
 from verify import (
     MAX_FRAMES,
-    MAX_PROBE_PHOTOS,
-    MIN_FRAMES,
     Decision,
     PhotoProbe,
     probe_of_embeddings,
@@ -131,17 +129,7 @@ async def _sent(call: Call) -> VerifyForm | VerifyJson:
         return sent
     runtime.required_pack()
     form = await read_form(request, VerifyForm, photos="image", most=MAX_FRAMES)
-    answers = form.challenge_id is not None
-    most = MAX_FRAMES if answers else MAX_PROBE_PHOTOS
-    if len(form.photos) > most:
-        raise too_many_images(most)
-    if answers and len(form.photos) < MIN_FRAMES:
-        raise ApiError(
-            "validation_failed",
-            f"a challenge is answered by {MIN_FRAMES} to {MAX_FRAMES} frames",
-            {"field": "images"},
-        )
-    runtime.liveness.require(photos=True, challenge=answers)
+    runtime.liveness.require(photos=True, challenge=form.challenge_id is not None)
     return form
 
 
