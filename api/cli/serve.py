@@ -18,7 +18,6 @@ from api.service.opening import (
     key_beside_database,
     open_deployment,
     prepare_database,
-    require_privacy,
 )
 from api.service.runtime import Runtime
 from api.service.server import listen, run_server, tls_options
@@ -94,7 +93,6 @@ def _opened(settings: Settings, *, check: bool) -> Iterator[Deployment]:
             message(f"warning: {warning}")
         for line in verdict_lines(contract.verdict):
             message(line)
-        require_privacy(contract, settings)
         if not deployment.store.api_keys.all():
             message("there is no API key yet: `veilface keys create --out FILE` makes one")
         yield deployment

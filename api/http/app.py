@@ -1,12 +1,11 @@
 """The REST application: routes, handlers and the life of one worker."""
 
-import gc
 import logging
 import os
 import threading
 from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
-from functools import cache, partial
+from functools import cache
 from importlib.metadata import version
 from typing import Any, NoReturn
 
@@ -15,11 +14,9 @@ import anyio.to_thread
 from fastapi import APIRouter, Depends, FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.routing import iter_route_contexts
-from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.middleware.cors import CORSMiddleware
 from starlette.routing import BaseRoute
-from starlette.types import Receive, Scope, Send
 
 from api.http.context import RequestContext
 from api.http.deps import refuse_unknown
@@ -47,7 +44,7 @@ from api.service.allocator import give_back
 from api.service.housekeeping import purge_regularly
 from api.service.logging import configure, log
 from api.service.metrics import BUILD, forget_dead_workers
-from api.service.opening import require_privacy, retention_of
+from api.service.opening import retention_of, weak_privacy
 from api.service.readiness import Readiness
 from api.service.runtime import Runtime
 from api.settings import Settings
@@ -70,20 +67,6 @@ API = (
 )
 
 
-class Cors(CORSMiddleware):
-    """Starlette's, but the application answers a preflight that is refused, in the one shape."""
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a preflight that is allowed, and let everything else through."""
-        if scope["type"] == "http" and scope["method"] == "OPTIONS":
-            headers = Headers(scope=scope)
-            asks = "origin" in headers and "access-control-request-method" in headers
-            if asks and self.preflight_response(request_headers=headers).status_code != 200:
-                await self.app(scope, receive, send)
-                return
-        await super().__call__(scope, receive, send)
-
-
 CORS_METHODS = ("GET", "PUT", "POST", "DELETE")
 CORS_REQUEST_HEADERS = (
     "Authorization",
@@ -91,7 +74,6 @@ CORS_REQUEST_HEADERS = (
     "If-Match",
     "If-None-Match",
     "Veilface-Holder-Key",
-    "X-API-Key",
     "X-Request-ID",
 )
 CORS_ANSWER_HEADERS = (
@@ -178,7 +160,7 @@ def _add_middleware(app: FastAPI, settings: Settings) -> None:
         # Keys travel in headers and never in a cookie, so credentials are not allowed: a page can
         # call with a key that it has, and with nothing that the browser keeps for the service.
         app.add_middleware(
-            Cors,
+            CORSMiddleware,
             allow_origins=sorted(settings.allowed_origins),
             allow_methods=CORS_METHODS,
             allow_headers=CORS_REQUEST_HEADERS,
@@ -203,7 +185,7 @@ async def _open(
     runtime = await anyio.to_thread.run_sync(open_runtime, settings)
     running.push_async_callback(_close, runtime)
     gate = Gate(slots=settings.resolved_compute_slots, waiting=settings.queue_limit)
-    readiness = Readiness(runtime.store, runtime.pack, gate, runtime.keyring)
+    readiness = Readiness(runtime, gate)
     app.state.rate_limits, app.state.runtime = rate_limits, runtime
     app.state.gate, app.state.readiness = gate, readiness
     forget_dead_workers()
@@ -215,27 +197,17 @@ async def _open(
         contract_id=runtime.contract.contract_id,
         pack=None if runtime.pack is None else runtime.pack.info.name,
     )
-    if (weakness := require_privacy(runtime.contract, settings)) is not None:
+    if (weakness := weak_privacy(runtime.contract)) is not None:
         log(
             "privacy is not proven: " + weakness,
             severity=logging.WARNING,
             contract_id=runtime.contract.contract_id,
         )
-    # What was made so far stays: looking through it for garbage would stop requests for 0.1 s.
-    gc.collect()
-    gc.freeze()
     give_back()
-    running.callback(gc.unfreeze)
     tasks = await running.enter_async_context(anyio.create_task_group())
     running.callback(tasks.cancel_scope.cancel)
-    tasks.start_soon(
-        partial(
-            purge_regularly,
-            runtime.store,
-            keep=retention_of(settings),
-            on_failure=readiness.note,
-        )
-    )
+    keep = retention_of(settings)
+    tasks.start_soon(purge_regularly, runtime.store, keep, readiness.note)
     tasks.start_soon(readiness.watch)
     if runtime.contract.takes_lifted_probes:
         # No lifted probe but one that comes now waits for it; an end of the process does not.

@@ -6,15 +6,15 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any, TypeVar
 
 from fastapi import Depends, Request, Security
-from fastapi.security import APIKeyHeader, HTTPAuthorizationCredentials, HTTPBearer
+from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
 from api.http.errors import ApiError
 from api.http.schemas import REQUEST_ID
-from api.http.tokens import SubjectToken, opened_token, prefix_of
+from api.http.tokens import TOKEN_PURPOSE, SubjectToken, opened
 from api.limits.admission import Gate
 from api.limits.rates import RateLimits
 from api.service.runtime import Runtime
-from templates.keys.api_token import is_token
+from templates.keys.api_token import SUBJECT_TOKEN, is_token
 from templates.store import TemplateStore
 from templates.store.api_keys import ApiKey
 from templates.store.audit_log import By
@@ -22,13 +22,9 @@ from templates.store.audit_log import By
 _bearer = HTTPBearer(
     auto_error=False, scheme_name="bearer", description="`Authorization: Bearer vf_…`, or `vft_…`"
 )
-_header = APIKeyHeader(
-    name="X-API-Key", auto_error=False, scheme_name="apiKey", description="`X-API-Key: vf_…`"
-)
 
 T = TypeVar("T")
 BearerDep = Annotated[HTTPAuthorizationCredentials | None, Security(_bearer)]
-HeaderDep = Annotated[str | None, Security(_header)]
 
 
 @dataclass(frozen=True)
@@ -112,20 +108,16 @@ class Call:
         return gate
 
 
-async def call_of(
-    request: Request,
-    bearer: BearerDep = None,
-    header: HeaderDep = None,
-) -> Call:
+async def call_of(request: Request, bearer: BearerDep = None) -> Call:
     """Recognise the API key of a request, or a token, which counts for the key that made it.
 
     An absent, an unknown and a revoked key are ``unauthorized`` in the same words.
     """
     runtime: Runtime = request.app.state.runtime
     gate: Gate = request.app.state.gate
-    text = bearer.credentials if bearer is not None else header
+    text = "" if bearer is None else bearer.credentials
     # What is neither a key nor a token costs no query.
-    if text is None or not (is_token(text) or prefix_of(text)):
+    if not (is_token(text) or SUBJECT_TOKEN.fullmatch(text)):
         raise _unauthorized()
     key, token = await gate.query(lambda: _recognised(runtime, text))
     if key is None:
@@ -148,7 +140,7 @@ async def call_of(
 def _unauthorized() -> ApiError:
     return ApiError(
         "unauthorized",
-        "send a valid API key or token: Authorization: Bearer vf_… or X-API-Key",
+        "send a valid API key or token: Authorization: Bearer vf_…",
         {},
         {"WWW-Authenticate": "Bearer"},
     )
@@ -156,14 +148,17 @@ def _unauthorized() -> ApiError:
 
 def _recognised(runtime: Runtime, text: str) -> tuple[ApiKey | None, SubjectToken | None]:
     """Look up an API key, or a token with the key that made it."""
-    keys, prefix = runtime.store.api_keys, prefix_of(text)
-    if prefix is None:
+    keys, token = runtime.store.api_keys, SUBJECT_TOKEN.fullmatch(text)
+    if token is None:
         return keys.verify(text), None
+    prefix, sealed = token.groups()
     key = keys.valid(prefix)
-    token = None if key is None else opened_token(runtime.keyring, text, key_id=key.id)
-    if key is None or token is None:
+    if key is None:
         return None, None
-    return key, token
+    found = opened(SubjectToken, sealed, runtime.keyring, TOKEN_PURPOSE, [key.id])
+    if found is None:
+        return None, None
+    return key, found
 
 
 AnyCall = Annotated[Call, Depends(call_of)]

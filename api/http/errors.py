@@ -238,13 +238,6 @@ def refuse_unknown_names(
 
 
 def plain_details(details: Mapping[str, Any]) -> dict[str, Any]:
-    """Return details as JSON values: numbers of NumPy become Python's, the rest becomes text."""
-
-    def plain(value: Any) -> Any:
-        try:
-            return float(value)
-        except (TypeError, ValueError):
-            return str(value)
-
-    plainly: dict[str, Any] = json.loads(to_json(details, inf_nan_mode="null", fallback=plain))
-    return plainly
+    """Return details as JSON values: NumPy's numbers as Python's, null for one that is not one."""
+    plain: dict[str, Any] = json.loads(to_json(details, inf_nan_mode="null", fallback=float))
+    return plain

@@ -2,6 +2,7 @@
 
 from api.http.errors import ApiError, StartError
 from api.settings import LivenessPolicy
+from models.errors import PackError
 from models.pack import ModelPack
 from templates.contract.document import Contract, Level
 from templates.errors import Uncalibrated
@@ -70,19 +71,20 @@ def _rate(level: Level) -> float:
 class LivenessRules:
     """The liveness policy of a deployment, which binds every caller.
 
-    A policy that asks for what contract and pack cannot tell is a `StartError`.
+    A policy that asks for what contract and pack cannot tell is a `StartError`. The liveness graphs
+    are loaded only where the policy asks.
     """
 
     def __init__(self, policy: LivenessPolicy, contract: Contract, pack: ModelPack | None) -> None:
         self.policy = policy
         self._has_detector = pack is not None and pack.info.detector is not None
-        lacking = None
-        if policy.active and not self._has_detector:
-            lacking = _NO_DETECTOR
-        elif policy.passive:
-            lacking = _lacking_passive(contract, pack)
-        if lacking is not None:
-            raise StartError(f"setting liveness asks for {policy}: {lacking}")
+        try:
+            if policy.active and not self._has_detector:
+                raise PackError(_NO_DETECTOR)
+            if policy.passive:
+                _require_passive(contract, pack)
+        except (PackError, Uncalibrated) as error:
+            raise StartError(f"setting liveness asks for {policy}: {error}") from None
 
     def require_challenges(self) -> None:
         """Refuse a challenge that the service could not hold frames against."""
@@ -91,21 +93,15 @@ class LivenessRules:
 
     def require(self, *, photos: bool, challenge: bool) -> None:
         """Refuse a probe that cannot show what the policy asks for, as ``forbidden``."""
-        details = {"liveness": str(self.policy)}
-        if self.policy is not LivenessPolicy.OFF and not photos:
-            raise ApiError(
-                "forbidden",
-                "liveness is asked for here, which embeddings and lifted probes cannot show: send "
-                "photos, with a challenge if the details say active or both",
-                details,
-            )
-        if self.policy.active and not challenge:
-            raise ApiError(
-                "forbidden",
-                "a challenge is asked for here: get one from POST /v1/challenges, and send its "
-                "challenge_id with the frames as images",
-                details,
-            )
+        if (self.policy is LivenessPolicy.OFF or photos) and (challenge or not self.policy.active):
+            return
+        raise ApiError(
+            "forbidden",
+            f"liveness ({self.policy}) is asked for here, which embeddings and lifted probes cannot"
+            " show: send photos; for active and both they are the frames that answer a challenge "
+            "(POST /v1/challenges), sent with its challenge_id",
+            {"liveness": str(self.policy)},
+        )
 
 
 _NO_DETECTOR = (
@@ -114,20 +110,13 @@ _NO_DETECTOR = (
 )
 
 
-def _lacking_passive(contract: Contract, pack: ModelPack | None) -> str | None:
-    graphs = None if pack is None else pack.liveness
-    if graphs is None:
-        return (
-            "the model pack has no liveness graph, which passive needs: add one to its folder "
-            "(docs/liveness.md), or choose active or off"
+def _require_passive(contract: Contract, pack: ModelPack | None) -> None:
+    if pack is None or pack.liveness is None:
+        raise PackError(
+            "the model pack has no liveness graph: add one to its folder (docs/liveness.md)"
         )
     if contract.liveness is None:
-        return (
-            "the contract has no liveness threshold, which passive needs: run `veilface "
-            "calibrate --liveness`, or choose active or off"
+        raise Uncalibrated(
+            "the contract has no liveness threshold: run `veilface calibrate --liveness`"
         )
-    try:
-        contract.liveness.require_graphs(graphs.graphs)
-    except Uncalibrated as error:
-        return str(error)
-    return None
+    contract.liveness.require_graphs(pack.liveness.graphs)

@@ -320,14 +320,14 @@ class PhotoCheckAnswer(_Answer):
 
     usable: bool
     code: Literal["no_face", "multiple_faces", "face_too_small", "low_quality"] | None = Field(
-        description="Why not, as an enrollment would say; null: it would do."
+        default=None, description="Why not, as an enrollment would say; null: it would do."
     )
     message: str
-    details: dict[str, Any] = Field(description="As those of the error of this code.")
+    details: dict[str, Any] = Field(default={}, description="As those of the error of this code.")
     box: list[float] | None = Field(
-        description="x1, y1, x2, y2 of the face in pixels of the upright photo, if usable."
+        default=None, description="x1, y1, x2, y2 in pixels of the upright photo, if usable."
     )
-    quality: dict[str, float | None] = Field(description="What was measured, if usable.")
+    quality: dict[str, float | None] = Field(default={}, description="Measures, if usable.")
 
 
 class HealthAnswer(_Answer):

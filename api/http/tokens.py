@@ -13,18 +13,17 @@ from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 from typing import Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from api.http.errors import ApiError
 from templates.errors import SealError
-from templates.keys.api_token import SUBJECT_TOKEN
 from templates.keys.sealing import MasterKeyring
 from templates.store.audit_log import token_digest
 from templates.store.lockout import Replayed
 from templates.store.subjects import Precondition
 
 Action = Literal["verify", "enroll"]
-_PURPOSE = "subject-token"
+TOKEN_PURPOSE = "subject-token"  # noqa: S105 - a label, not a secret
 
 CALLS: dict[str, frozenset[Action]] = {
     "enroll": frozenset({"enroll"}),
@@ -85,9 +84,16 @@ class SubjectToken(Sealed):
     subject: str
     action: Action
     level: str | None
-    token_id: str
     key_prefix: str
     replace: bool = True
+    token_id: str = Field(default_factory=lambda: secrets.token_urlsafe(18))
+
+    def text(self, keyring: MasterKeyring, *, key_id: str) -> str:
+        """Return the token as a browser sends it.
+
+        `key_id`, the row of the API key, is in the database alone: the master key makes no token.
+        """
+        return f"vft_{self.key_prefix}_{self.sealed(keyring, TOKEN_PURPOSE, [key_id])}"
 
     @property
     def digest(self) -> str:
@@ -97,16 +103,14 @@ class SubjectToken(Sealed):
     def require(self, route: str, subject: str | None) -> None:
         """Refuse a call that the token is not for; `subject` is the one that the path names."""
         if self.action not in CALLS.get(route, ()):
-            raise _another("call", f"this token is good to {self.action}, and not for this call")
+            raise _for_another("call", f"it is good to {self.action}, and not for this call")
         if subject is not None and unicodedata.normalize("NFC", subject) != self.subject:
-            raise _another("subject", "this token is for another subject")
+            raise _for_another("subject", "it is for another subject")
 
     def level_of(self, asked: str | None) -> str | None:
         """Return the level to decide at; a request for another one is ``forbidden``."""
         if asked not in (None, self.level):
-            raise _another(
-                "level", "this token is for another security level: ask for its own, or for none"
-            )
+            raise _for_another("level", "it is for another security level: ask for none")
         return self.level
 
     def precondition(self, asked: Precondition | None) -> Precondition | None:
@@ -114,48 +118,9 @@ class SubjectToken(Sealed):
         if self.replace:
             return asked
         if asked is not None and asked.template_id is not None:
-            raise _another("replace", "this token replaces no enrollment: send no If-Match with it")
+            raise _for_another("replace", "it replaces no enrollment: send no If-Match with it")
         return Precondition(None)
 
 
-def _another(what: str, message: str) -> ApiError:
-    return ApiError("forbidden", message, {"token": what})
-
-
-def new_token(
-    keyring: MasterKeyring,
-    *,
-    key_id: str,
-    key_prefix: str,
-    subject: str,
-    action: Action,
-    level: str | None,
-    lifetime_s: int,
-    replace: bool = True,
-) -> tuple[SubjectToken, str]:
-    """Make a token; return it with its text, which is shown once.
-
-    `key_id`, the row of the API key, is in the database alone: the master key makes no token.
-    """
-    token = SubjectToken(
-        subject=subject,
-        action=action,
-        level=level,
-        token_id=secrets.token_urlsafe(18),
-        key_prefix=key_prefix,
-        expires_at=ends_in(lifetime_s),
-        replace=replace,
-    )
-    return token, f"vft_{key_prefix}_{token.sealed(keyring, _PURPOSE, [key_id])}"
-
-
-def prefix_of(text: str) -> str | None:
-    """Return the prefix of the API key that a token names; None for what is no token."""
-    match = SUBJECT_TOKEN.fullmatch(text)
-    return None if match is None else match[1]
-
-
-def opened_token(keyring: MasterKeyring, text: str, *, key_id: str) -> SubjectToken | None:
-    """Open a token that the API key of this row asked for, in time or not; None for any other."""
-    match = SUBJECT_TOKEN.fullmatch(text)
-    return None if match is None else opened(SubjectToken, match[2], keyring, _PURPOSE, [key_id])
+def _for_another(what: str, message: str) -> ApiError:
+    return ApiError("forbidden", f"this token: {message}", {"token": what})

@@ -12,16 +12,12 @@ from api.service.metrics import PURGE_FAILURES
 from templates.store import TemplateStore
 from templates.store.retention import Retention
 
-FOR_EVER = Retention()
 EVERY_S = 600.0
 """Between two rounds."""
 
 
 async def purge_regularly(
-    store: TemplateStore,
-    *,
-    keep: Retention = FOR_EVER,
-    on_failure: Callable[[Exception], None] = lambda _: None,
+    store: TemplateStore, keep: Retention, on_failure: Callable[[Exception], None]
 ) -> None:
     """Purge at once and then every ``EVERY_S`` seconds, until it is cancelled.
 

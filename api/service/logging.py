@@ -13,31 +13,11 @@ import sys
 from typing import Any
 
 LOGGER, UVICORN = "veilface", "uvicorn"
-FIELDS = frozenset(
-    {
-        "request_id",
-        "method",
-        "route",
-        "status",
-        "code",
-        "duration_ms",
-        "tenant",
-        "key_id",
-        "token_id",
-        "subject",
-        "decision",
-        "liveness",
-        "security_level",
-        "error_type",
-        "receipt_id",
-        "log_purged",
-        "subjects",
-        "contract_id",
-        "version",
-        "pack",
-        "pid",
-    }
-)
+FIELDS = frozenset({
+    "request_id", "method", "route", "status", "code", "duration_ms", "tenant", "key_id",
+    "token_id", "subject", "decision", "liveness", "security_level", "error_type", "receipt_id",
+    "log_purged", "subjects", "contract_id", "version", "pack", "pid",
+})  # fmt: skip
 
 
 class JsonLines(logging.Formatter):

@@ -64,6 +64,11 @@ def open_deployment(settings: Settings, *, contract: Contract | None = None) -> 
     """
     keyring = open_keyring(settings)
     contract = contract or open_contract(settings, keyring)
+    if settings.require_private and (why := weak_privacy(contract)) is not None:
+        raise StartError(
+            f"privacy is not proven, and require_private asks for it: {why}. Build decoys that are "
+            "like your people (`veilface decoys build --like`) and calibrate again"
+        )
     source = open_decoys(settings, keyring, contract)
     return Deployment(settings, keyring, open_store(settings, keyring), contract, source)
 
@@ -203,17 +208,6 @@ def weak_privacy(contract: Contract) -> str | None:
             "that passes"
         )
     return privacy.shortfall or f"{rate.trials} templates are too few to show it"
-
-
-def require_privacy(contract: Contract, settings: Settings) -> str | None:
-    """Return why privacy is not proven, or None; with ``require_private``, refuse the contract."""
-    why = weak_privacy(contract)
-    if why is not None and settings.require_private:
-        raise StartError(
-            f"privacy is not proven, and require_private asks for it: {why}. Build decoys that are "
-            "like your people (`veilface decoys build --like`) and calibrate again"
-        )
-    return why
 
 
 def open_decoys(

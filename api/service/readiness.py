@@ -9,11 +9,9 @@ from api.limits.admission import Gate
 from api.service.logging import log
 from api.service.metrics import MODEL_UP, STORE_UP
 from api.service.opening import try_inference
+from api.service.runtime import Runtime
 from models.errors import ModelError
-from models.pack import ModelPack
 from templates.errors import StoreBusy, StoreError
-from templates.keys.sealing import MasterKeyring
-from templates.store import TemplateStore
 from templates.store.tenants import RetiredRotation
 
 WATCH_S = 5.0
@@ -27,13 +25,9 @@ class Readiness:
     failure the thing that failed must succeed once before the worker is ready again.
     """
 
-    def __init__(
-        self, store: TemplateStore, pack: ModelPack | None, gate: Gate, keyring: MasterKeyring
-    ) -> None:
-        self._store = store
-        self._keyring = keyring
+    def __init__(self, runtime: Runtime, gate: Gate) -> None:
+        self._store, self._pack, self._keyring = runtime.store, runtime.pack, runtime.keyring
         self._stale = False
-        self._pack = pack
         self._gate = gate
         self._failed: set[str] = set()
         for gauge in UP.values():
@@ -42,11 +36,19 @@ class Readiness:
     def note(self, error: Exception) -> None:
         """Take note of an error that some work ended with, if it says that store or model fail."""
         code = api_error(error).code
-        passing = isinstance(error, StoreBusy | RetiredRotation)
-        if code == "store_unavailable" and isinstance(error, StoreError) and not passing:
-            self._fail("store", error)
-        elif code == "model_unavailable" and not isinstance(error, ApiError):
-            self._fail("model", error)
+        if isinstance(error, ApiError | StoreBusy | RetiredRotation):
+            return
+        if code == "store_unavailable" and isinstance(error, StoreError):
+            failed = "store"
+        elif code == "model_unavailable":
+            failed = "model"
+        else:
+            return
+        if failed not in self._failed:
+            kind = type(error).__name__
+            log(f"{failed} failed", severity=logging.ERROR, code=code, error_type=kind)
+        self._failed.add(failed)
+        UP[failed].set(0)
 
     async def check(self) -> None:
         """Ask the database, and try again what failed last."""
@@ -87,19 +89,7 @@ class Readiness:
         except StartError as error:
             raise ModelError(str(error)) from error
 
-    def _fail(self, what: str, error: Exception) -> None:
-        if what not in self._failed:
-            log(
-                f"{what} failed",
-                severity=logging.ERROR,
-                code=f"{what}_unavailable",
-                error_type=type(error).__name__,
-            )
-        self._failed.add(what)
-        UP[what].set(0)
-
     def _recovered(self, what: str) -> None:
-        if what in self._failed:
-            log(f"{what} is available again")
+        log(f"{what} is available again")
         self._failed.discard(what)
         UP[what].set(1)

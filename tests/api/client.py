@@ -1,16 +1,11 @@
 """A blocking HTTP client of an application in this process, with its start and stop."""
 
-from types import SimpleNamespace, TracebackType
+from types import TracebackType
 from typing import Any, Self
-from unittest.mock import patch
 
 import httpx
 from anyio.from_thread import BlockingPortal, start_blocking_portal
 from fastapi import FastAPI
-
-# A service begins by looking through its process for garbage. In one that holds all the tests, this
-# takes longer than most of them.
-NO_COLLECTION = SimpleNamespace(collect=int, freeze=int, unfreeze=int)
 
 
 class Client:
@@ -27,8 +22,7 @@ class Client:
             context = self._portal.wrap_async_context_manager(
                 self.app.router.lifespan_context(self.app)
             )
-            with patch("api.http.app.gc", NO_COLLECTION):
-                context.__enter__()
+            context.__enter__()
         except BaseException as error:
             self._running.__exit__(type(error), error, error.__traceback__)
             raise

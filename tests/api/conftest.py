@@ -5,12 +5,11 @@ What differs between the two is the store's, whose own tests run on both.
 
 from collections.abc import Iterator
 from pathlib import Path
-from unittest.mock import patch
 
 import pytest
 
 from api.http.app import create_app
-from tests.api.client import NO_COLLECTION, Client
+from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, deploy
 from tests.databases import (
     migrate_ahead,
@@ -18,13 +17,6 @@ from tests.databases import (
     postgres_url,  # noqa: F401
     url_of,
 )
-
-
-@pytest.fixture(scope="session", autouse=True)
-def no_collection() -> Iterator[None]:
-    """What tests imported stays out of the collector's sight, whoever starts a service."""
-    with patch("api.http.app.gc", NO_COLLECTION):
-        yield
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from api.http.requests import LONGEST_S
-from api.http.tokens import new_token
+from api.http.tokens import SubjectToken, ends_in
 from api.service.opening import open_keyring, open_store
 from models.pack import ModelPack
 from tests.api.deployment import Deployment, bearer, images, photo
@@ -149,16 +149,14 @@ class Tokens:
 
     def once(self, subject: str) -> str:
         """Make a token as ``POST /v1/tokens`` does, without a request: for one verification."""
-        _, text = new_token(
-            self._keyring,
-            key_id=self._key.id,
-            key_prefix=self._key.prefix,
+        token = SubjectToken(
             subject=subject,
             action="verify",
             level=None,
-            lifetime_s=LONGEST_S,
+            key_prefix=self._key.prefix,
+            expires_at=ends_in(LONGEST_S),
         )
-        return text
+        return token.text(self._keyring, key_id=self._key.id)
 
 
 class Clients:

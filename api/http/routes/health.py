@@ -5,7 +5,7 @@ from fastapi import APIRouter, Depends, Request
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
 from starlette.responses import Response
 
-from api.http.auth import BearerDep, HeaderDep, call_of
+from api.http.auth import BearerDep, call_of
 from api.http.schemas import HealthAnswer
 from api.service.metrics import exposition
 from api.service.readiness import Readiness
@@ -29,12 +29,10 @@ async def ready(request: Request) -> HealthAnswer:
     return HealthAnswer(status="ok")
 
 
-async def may_read_metrics(
-    request: Request, bearer: BearerDep = None, header: HeaderDep = None
-) -> None:
+async def may_read_metrics(request: Request, bearer: BearerDep = None) -> None:
     """Demand a key with the right, unless the setting opens the metrics."""
     if not request.app.state.settings.open_metrics:
-        (await call_of(request, bearer, header)).require("metrics")
+        (await call_of(request, bearer)).require("metrics")
 
 
 @router.get(

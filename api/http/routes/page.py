@@ -15,7 +15,6 @@ from starlette.responses import Response
 from starlette.routing import BaseRoute, Route
 
 from api.http.deps import has_copy, refuse_body, refuse_unknown
-from api.http.errors import ApiError
 
 WEB = Path(__file__).resolve().parents[2] / "web"
 CLIENT = WEB / "client"
@@ -60,7 +59,7 @@ class Served:
     suffix: str
     headers: Mapping[str, str] = field(default_factory=lambda: HEADERS)
 
-    def answer(self, request: Request) -> Response:
+    async def answer(self, request: Request) -> Response:
         """Return the file, or that the browser's copy is still the same."""
         headers = {**self.headers, "ETag": f'"{hashlib.sha256(self.body).hexdigest()[:32]}"'}
         if has_copy(request, headers["ETag"]):
@@ -87,18 +86,11 @@ def page_routes(*, demo: bool, serve_pack: bool) -> list[BaseRoute]:
         suffix = Path(path.stem).suffix
         assets[f"{CLIENT.name}/{path.stem}"] = Served(path.read_bytes(), suffix, zipped)
     index = Served(html.encode(), ".html", headers)
-
-    async def page(request: Request) -> Response:
-        return index.answer(request)
-
-    async def asset(request: Request) -> Response:
-        file = assets.get(request.path_params["name"])
-        if file is None:
-            raise ApiError("not_found", "there is no such path")
-        return file.answer(request)
-
     # A person follows a link to the page, to which mail and search programs add parameters.
-    return [route_of("/", page, check=refuse_body), route_of("/assets/{name:path}", asset)]
+    return [
+        route_of("/", index.answer, check=refuse_body),
+        *(route_of(f"/assets/{name}", file.answer) for name, file in assets.items()),
+    ]
 
 
 def route_of(path: str, endpoint: Endpoint, *, check: Check = refuse_unknown) -> Route:

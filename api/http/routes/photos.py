@@ -45,22 +45,13 @@ async def check_photo(call: EnrollsOrVerifies) -> PhotoCheckAnswer:
                     taken = pack.crop_photo(sent.image[0], policy=sent.face)
             except FaceError as refusal:
                 code: Any = refusal.code
+                details = plain_details(refusal.details)
                 return PhotoCheckAnswer(
-                    usable=False,
-                    code=code,
-                    message=str(refusal),
-                    details=plain_details(refusal.details),
-                    box=None,
-                    quality={},
+                    usable=False, code=code, message=str(refusal), details=details
                 )
-            message = "one face, large and clear enough"
-            if taken.face is None:
-                message = "an aligned crop of a face, clear enough"
             return PhotoCheckAnswer(
                 usable=True,
-                code=None,
-                message=message,
-                details={},
+                message="one face, large and clear enough",
                 box=None if taken.box is None else [round(side, 1) for side in taken.box],
                 quality=taken.quality.as_dict(),
             )

@@ -9,8 +9,6 @@ from collections.abc import Mapping
 from importlib.resources import files
 from typing import Any
 
-from starlette.requests import Request
-from starlette.responses import Response
 from starlette.routing import BaseRoute
 
 from api.http.routes.page import HEADERS, Served, route_of
@@ -40,7 +38,7 @@ def reference_routes() -> list[BaseRoute]:
     contents = {"/docs": (PAGE.encode(), ".html"), "/docs/start.js": (START.encode(), ".js")}
     for name, suffix in (("swagger-ui-bundle.js", ".js"), ("swagger-ui.css", ".css")):
         contents[f"/docs/{name}"] = (brought.joinpath(name).read_bytes(), suffix)
-    return [_file(path, Served(*content, POLICY)) for path, content in contents.items()]
+    return [route_of(path, Served(*content, POLICY).answer) for path, content in contents.items()]
 
 
 def document_routes(document: Mapping[str, Any], *, root_path: str) -> list[BaseRoute]:
@@ -48,11 +46,5 @@ def document_routes(document: Mapping[str, Any], *, root_path: str) -> list[Base
     if root_path:
         document = {"servers": [{"url": root_path}], **document}
     text = json.dumps(document, separators=(",", ":")).encode()
-    return [_file("/v1/openapi.json", Served(text, ".json", {"Cache-Control": "no-cache"}))]
-
-
-def _file(path: str, file: Served) -> BaseRoute:
-    async def serve(request: Request) -> Response:
-        return file.answer(request)
-
-    return route_of(path, serve)
+    file = Served(text, ".json", {"Cache-Control": "no-cache"})
+    return [route_of("/v1/openapi.json", file.answer)]

@@ -10,7 +10,7 @@ from api.http.deps import SubjectDep
 from api.http.openapi import body_of
 from api.http.requests import TokenJson
 from api.http.schemas import TokenAnswer, TokenOutcomeAnswer
-from api.http.tokens import new_token
+from api.http.tokens import SubjectToken, ends_in
 from api.service.metrics import TOKENS
 from templates.store.audit_log import Entry, token_digest
 
@@ -39,15 +39,13 @@ async def create_token(call: AnyCall) -> TokenAnswer:
     level = None
     if asked.action == "verify":
         level = runtime.levels.in_force(asked.level, lowest_of_key=call.key.lowest_level)
-    token, text = new_token(
-        runtime.keyring,
-        key_id=call.key.id,
-        key_prefix=call.key.prefix,
+    token = SubjectToken(
         subject=asked.subject_id,
         action=asked.action,
         level=level,
-        lifetime_s=asked.lifetime_s,
+        key_prefix=call.key.prefix,
         replace=asked.replace,
+        expires_at=ends_in(asked.lifetime_s),
     )
     detail = f"{token.action} {token.token_id}"
     entry = Entry("token", "issued", call.by, call.tenant, pseudonym, detail)
@@ -55,7 +53,7 @@ async def create_token(call: AnyCall) -> TokenAnswer:
     call.request.state.log["token_id"] = token.token_id
     TOKENS.labels(token.action).inc()
     return TokenAnswer(
-        token=text,
+        token=token.text(runtime.keyring, key_id=call.key.id),
         token_id=token.token_id,
         subject_id=token.subject,
         action=token.action,

@@ -36,7 +36,6 @@ def test_every_call_needs_its_right(
         {"Authorization": "Basic dXNlcjpwYXNz"},
         {"Authorization": "Bearer vf_000000000000_" + "0" * 64},
         {"Authorization": "Bearer " + "x" * 5000},
-        {"Authorization": "", "X-API-Key": "vf_x"},
     ):
         answer = client.request(method, path, headers=headers)
         assert_error(answer, 401, "unauthorized")
@@ -55,16 +54,6 @@ def test_rights_are_asked_before_the_body_is_read(client: Client, keys: dict[str
         headers={**bearer(keys["enroll"]), "Content-Length": str(10**12)},
     )
     assert_error(answer, 403, "forbidden")
-
-
-def test_both_headers_are_taken(client: Client, deployment: Deployment) -> None:
-    token = deployment.key("verify")
-    for headers in (
-        bearer(token),
-        {"Authorization": f"bearer {token}"},
-        {"Authorization": "", "X-API-Key": token},
-    ):
-        assert client.get("/v1/contract", headers=headers).status_code == 200
 
 
 def test_a_revoked_key_stops_at_once(client: Client, deployment: Deployment) -> None:

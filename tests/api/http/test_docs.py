@@ -102,13 +102,13 @@ def test_every_operation_answers_errors_in_the_one_shape(document: dict[str, Any
 
 
 def test_security_is_declared(document: dict[str, Any]) -> None:
-    assert set(document["components"]["securitySchemes"]) == {"bearer", "apiKey"}
+    assert set(document["components"]["securitySchemes"]) == {"bearer"}
     for (_, path), operation in operations(document).items():
         if path.startswith("/health"):
             assert "security" not in operation
         else:
             schemes = {name for entry in operation["security"] for name in entry}
-            assert schemes == {"bearer", "apiKey"}
+            assert schemes == {"bearer"}
 
 
 def test_bodies_are_documented_with_all_their_fields(document: dict[str, Any]) -> None:

@@ -20,7 +20,7 @@ from api.http.schemas import (
     TokenOutcomeAnswer,
     VerifyAnswer,
 )
-from api.http.tokens import SubjectToken, new_token
+from api.http.tokens import SubjectToken, ends_in
 from api.service.opening import open_keyring, open_store
 from templates.keys.holder_key import decode_holder_key
 from templates.store import archive_audit_log
@@ -383,16 +383,14 @@ def test_a_token_that_ends_while_its_body_comes_is_refused(
 
 def test_the_master_key_alone_makes_no_token(shared: Service) -> None:
     client, deployment = shared
-    prefix = deployment.token[3:15]
-    _, forged = new_token(
-        open_keyring(deployment.settings),
-        key_id="0" * 32,
-        key_prefix=prefix,
+    token = SubjectToken(
         subject="alice",
         action="enroll",
         level=None,
-        lifetime_s=120,
+        key_prefix=deployment.token[3:15],
+        expires_at=ends_in(LONGEST_S),
     )
+    forged = token.text(open_keyring(deployment.settings), key_id="0" * 32)
     assert_error(enroll(client, forged, 2, "alice"), 401, "unauthorized")
 
 
