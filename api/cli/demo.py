@@ -60,10 +60,8 @@ def demo(
 def _text(outcome: Outcome) -> list[str | Table]:
     notice = [DEMO_NOTICE] if outcome.demo_model else []
     suffix = "".join(f"  ({one})" for one in notice)
-    at_default = f"Who was accepted, at level {outcome.default_level}{suffix}"
     tables = {
-        at_default: outcome.people,
-        f"Security levels{suffix}": outcome.levels,
+        f"Who was accepted, at level {outcome.level}{suffix}": outcome.people,
         f"What is stored: {outcome.strategy}{suffix}": outcome.stored,
     }
     folder = outcome.folder

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from api.http.errors import StartError
-from api.http.routes.drawn_people import ENROLLED, ENROLLED_PHOTOS, PROBE_PHOTOS, STRANGERS
+from api.http.routes.drawn_people import ENROLLED, ENROLLED_PHOTOS, SHOTS, STRANGERS
 from models.synthetic import draw_face, encode_photo
 from verify import LabelledFolder, labelled_folder
 
@@ -22,19 +22,25 @@ class Scale:
 
 @dataclass(frozen=True)
 class Cast:
-    """Who plays which part: photo files, by person.
+    """Photo files of those who are enrolled, of strangers, for decoys and for the calibration.
 
     ``face`` is what a photo with several faces means: labelled photos of the press show
     bystanders, so real ones are taken as showing the largest.
     """
 
     enrolled: dict[str, list[Path]]
-    strangers: dict[str, Path]
+    strangers: list[Path]
+    decoys: list[Path]
+    calibration: LabelledFolder
     face: str = "dominant"
 
+    def probes(self, name: str) -> list[Path]:
+        """Photos of an enrolled person that the enrollment does not use."""
+        return self.enrolled[name][ENROLLED_PHOTOS:SHOTS]
 
-def drawn_cast(folder: Path, scratch: Path, size: Scale) -> tuple[Cast, list[Path], LabelledFolder]:
-    """Draw everybody; the seeds of those four groups are disjoint."""
+
+def drawn_cast(folder: Path, scratch: Path, size: Scale) -> Cast:
+    """Draw everybody; the seeds of the four groups are disjoint."""
 
     def draw(root: Path, first: int, people: int, photos: int) -> dict[str, list[Path]]:
         drawn: dict[str, list[Path]] = {}
@@ -46,51 +52,37 @@ def drawn_cast(folder: Path, scratch: Path, size: Scale) -> tuple[Cast, list[Pat
                 path.write_bytes(encode_photo(draw_face(seed, photo)))
         return drawn
 
-    enrolled = draw(folder, ENROLLED.start, size.enrolled, ENROLLED_PHOTOS + PROBE_PHOTOS)
+    draw(scratch / "faces", 200_000, size.calibration_people, size.calibration_photos)
     strangers = draw(folder, STRANGERS.start, size.strangers, 1)
     decoys = draw(scratch / "decoys", 100_000, size.decoy_people, 1)
-    draw(scratch / "faces", 200_000, size.calibration_people, size.calibration_photos)
-    return (
-        Cast(enrolled, {name: photos[0] for name, photos in strangers.items()}),
+    return Cast(
+        draw(folder, ENROLLED.start, size.enrolled, SHOTS),
+        [photos[0] for photos in strangers.values()],
         [photos[0] for photos in decoys.values()],
         labelled_folder(scratch / "faces"),
     )
 
 
-def found_cast(faces: Path, size: Scale) -> tuple[Cast, list[Path], LabelledFolder]:
+def found_cast(faces: Path, size: Scale) -> Cast:
     """Share out real people: enrolled, strangers, then half for decoys, half for calibration."""
     labelled = labelled_folder(faces)
     photos_of: dict[str, list[Path]] = {}
     for path, name in zip(labelled.paths, labelled.identities, strict=True):
         photos_of.setdefault(name, []).append(path)
-    needed = ENROLLED_PHOTOS + PROBE_PHOTOS
-    able = [name for name, photos in photos_of.items() if len(photos) >= needed][: size.enrolled]
-    if len(able) < size.enrolled:
-        raise StartError(
-            f"{faces} has {len(able)} people with {needed} photos or more; the demo enrolls "
-            f"{size.enrolled}"
-        )
-    rest = [name for name in photos_of if name not in set(able)]
+    able = [name for name, photos in photos_of.items() if len(photos) >= SHOTS][: size.enrolled]
+    rest = [name for name in photos_of if name not in able]
     strangers, rest = rest[: size.strangers], rest[size.strangers :]
-    for_decoys, for_calibration = set(rest[::2]), set(rest[1::2])
-    kept = [
-        (path, name)
-        for path, name in zip(labelled.paths, labelled.identities, strict=True)
-        if name in for_calibration
-    ]
-    if not kept:
-        raise StartError(f"{faces} has too few people to calibrate on; 80 or more are good")
-    return (
-        Cast(
-            {name: photos_of[name][:needed] for name in able},
-            {name: photos_of[name][0] for name in strangers},
-            face="largest",
-        ),
-        [path for name in rest if name in for_decoys for path in photos_of[name]],
-        LabelledFolder(
-            labelled.root,
-            tuple(path for path, _ in kept),
-            tuple(name for _, name in kept),
-            labelled.ignored,
-        ),
+    calibrated = [(path, name) for name in rest[1::2] for path in photos_of[name]]
+    if len(able) < size.enrolled or not calibrated:
+        raise StartError(
+            f"{faces} has too few people: {size.enrolled} with {SHOTS} photos or more are enrolled "
+            "in the demo, and it calibrates on others, of whom 80 or more are good"
+        )
+    paths, names = zip(*calibrated, strict=True)
+    return Cast(
+        {name: photos_of[name][:SHOTS] for name in able},
+        [photos_of[name][0] for name in strangers],
+        [path for name in rest[::2] for path in photos_of[name]],
+        LabelledFolder(labelled.root, paths, names, labelled.ignored),
+        face="largest",
     )

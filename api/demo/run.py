@@ -26,7 +26,7 @@ from api.demo.service import running_service
 from api.demo.storage import KEY_FILE, Stored, create_key, read_stored, rows_of
 from api.http.errors import StartError
 from api.http.receipts import read_receipt_key, verify_answer
-from api.http.routes.drawn_people import ENROLLED_PHOTOS, PROBE_PHOTOS
+from api.http.routes.drawn_people import ENROLLED_PHOTOS
 from api.service.opening import file_sealer
 from api.service.settings_file import Value, settings_text
 from models.demo import build_demo_pack, is_demo_model
@@ -36,7 +36,7 @@ from templates.contract.document import Contract
 from templates.contract.verdict import Verdict
 from templates.keys.sealing import MasterKeyring
 from templates.space.lifting import Strategy
-from verify import CalibrationOptions, LabelledFolder
+from verify import CalibrationOptions
 from verify.preparation import make_generator
 
 MARKER = "# Written by `veilface demo`, which replaces this folder when it runs again."
@@ -46,14 +46,13 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Counts:
-    """How the service answered: attempts on one person, or at one security level."""
+    """How the service answered attempts on one person."""
 
     name: str
     genuine_accepted: int
     genuine_trials: int
     impostors_accepted: int
     impostor_trials: int
-    fmr: float
 
 
 @dataclass(frozen=True)
@@ -67,8 +66,7 @@ class Outcome:
     verdict: Verdict | None
     strategy: str
     people: tuple[Counts, ...]
-    levels: tuple[Counts, ...]
-    default_level: str
+    level: str
     stored: tuple[Stored, ...]
     erased: str
     receipt: dict[str, Any]
@@ -112,10 +110,10 @@ def run_demo(
         if pack is None or faces is None:
             say("building the demo model and drawing faces")
             pack = build_demo_pack(folder / "pack")
-            cast, decoy_photos, labelled = drawn_cast(folder / "people", Path(scratch), size)
+            cast = drawn_cast(folder / "people", Path(scratch), size)
         else:
-            cast, decoy_photos, labelled = found_cast(faces, size)
-        contract = _calibrate(folder, pack, decoy_photos, labelled, m=m, say=say)
+            cast = found_cast(faces, size)
+        contract = _calibrate(folder, pack, cast, m=m, say=say)
     _write_settings(folder, pack, demo=is_demo_model(contract.binding.embedder_sha256))
     say("starting the service")
     with running_service(folder, create_key(folder)) as client:
@@ -151,19 +149,11 @@ def _prepare_folder(folder: Path) -> None:
     settings.write_text(MARKER + "\n", encoding="utf-8")
 
 
-def _calibrate(
-    folder: Path,
-    pack_path: Path,
-    decoy_photos: Sequence[Path],
-    labelled: LabelledFolder,
-    *,
-    m: int,
-    say: Say,
-) -> Contract:
+def _calibrate(folder: Path, pack_path: Path, cast: Cast, *, m: int, say: Say) -> Contract:
     """Do what ``decoys build`` and ``calibrate`` do."""
-    pack = ModelPack.load(pack_path)
-    say(f"embedding {len(decoy_photos)} faces for the decoys")
-    generator = make_generator(_extract(pack, decoy_photos), pack)
+    pack, labelled = ModelPack.load(pack_path), cast.calibration
+    say(f"embedding {len(cast.decoys)} faces for the decoys")
+    generator = make_generator(_extract(pack, cast.decoys), pack)
     generator.save(folder / "decoys.veil")
     say(f"embedding {len(labelled)} photos of {labelled.people} people for the calibration")
     extraction = _extract(pack, labelled.paths)
@@ -230,24 +220,12 @@ def _play(
     if not enrolled:
         raise StartError("nobody could be enrolled: " + "; ".join(refused))
     say("verifying genuine and impostor photos over HTTP")
-    rates = {level.name: level.stated_fmr for level in contract.calibration("p2s").levels}
-    default = contract.default_level
-    attempts = _attempts(client, cast, enrolled, [*rates], refused)
-    at_default = [attempt for attempt in attempts if attempt.level == default]
-    people = tuple(
-        _counts(name, rates[default], [a for a in at_default if a.subject == name])
-        for name in cast.enrolled
-    )
-    levels = tuple(
-        _counts(level, rate, [a for a in attempts if a.level == level])
-        for level, rate in rates.items()
-    )
+    people = tuple(_verify(client, cast, name, refused) for name in cast.enrolled)
     stored = read_stored(folder, enrolled)
     say("erasing one person and checking the receipt")
     erased = enrolled[0]
     receipt, faults = _erase(client, erased, cast.enrolled[erased][-1])
     rows = rows_of(folder, erased)
-    faults += faults_of(people)
     if rows:
         faults.append(f"{rows} rows of {erased} are left in the database after the erasure")
     binding = contract.binding
@@ -259,100 +237,61 @@ def _play(
         verdict=contract.verdict,
         strategy=f"{binding.strategy}, m = {binding.m}, n = {binding.n}",
         people=people,
-        levels=levels,
-        default_level=default,
+        level=contract.default_level,
         stored=stored,
         erased=erased,
         receipt=receipt,
         rows_after_erasure=rows,
         refused_photos=tuple(dict.fromkeys(refused)),
         seconds=time.monotonic() - started,
-        faults=tuple(faults),
+        faults=(*faults, *faults_of(people)),
     )
 
 
-@dataclass(frozen=True)
-class _Attempt:
-    subject: str
-    genuine: bool
-    level: str
-    accepted: bool
+def _verify(client: httpx.Client, cast: Cast, name: str, refused: list[str]) -> Counts:
+    """Show one subject photos of this person, and of all others; count who is accepted.
 
-
-def _attempts(
-    client: httpx.Client,
-    cast: Cast,
-    enrolled: Sequence[str],
-    levels: Sequence[str],
-    refused: list[str],
-) -> list[_Attempt]:
-    """Show every probe photo to every enrolled subject, at every level.
-
-    Somebody who was not enrolled, and a photo that cannot be used, count as rejected. The failed
-    attempts on a subject are forgotten at the end: `veilface serve` would take them for a lock.
+    A photo that cannot be used counts as rejected. The failed attempts are forgotten at the end:
+    `veilface serve` would take them for a lock.
     """
-    probes = [
-        (name, photo)
-        for name, photos in cast.enrolled.items()
-        for photo in photos[ENROLLED_PHOTOS : ENROLLED_PHOTOS + PROBE_PHOTOS]
-    ]
-    probes += list(cast.strangers.items())
-    attempts = [
-        _Attempt(name, True, level, False)
-        for name in cast.enrolled
-        if name not in enrolled
-        for level in levels
-        for _ in range(PROBE_PHOTOS)
-    ]
-    for owner, photo in probes:
-        for subject in enrolled:
-            for level in levels:
-                path = f"/v1/subjects/{subject}/verify"
-                answer = _send(client, "POST", path, [photo], level=level, face=cast.face)
-                accepted = False
-                if answer.status_code == httpx.codes.OK:
-                    accepted = answer.json()["decision"] == "accept"
-                else:
-                    refused.append(f"{owner}/{photo.name}: {_code(answer)}")
-                attempts.append(_Attempt(subject, owner == subject, level, accepted))
-    for subject in enrolled:
-        client.delete(f"/v1/subjects/{subject}/lockout").raise_for_status()
-    return attempts
+
+    def accepted(photo: Path) -> bool:
+        path = f"/v1/subjects/{name}/verify"
+        answer = _send(client, "POST", path, [photo], face=cast.face)
+        if answer.status_code != httpx.codes.OK:
+            refused.append(f"{photo.parent.name}/{photo.name}: {_code(answer)}")
+            return False
+        return bool(answer.json()["decision"] == "accept")
+
+    genuine = [accepted(photo) for photo in cast.probes(name)]
+    others = [photo for other in cast.enrolled if other != name for photo in cast.probes(other)]
+    impostors = [accepted(photo) for photo in (*others, *cast.strangers)]
+    client.delete(f"/v1/subjects/{name}/lockout").raise_for_status()
+    return Counts(name, sum(genuine), len(genuine), sum(impostors), len(impostors))
 
 
 def _send(
     client: httpx.Client, method: str, path: str, photos: Sequence[Path], **fields: str
 ) -> httpx.Response:
-    name = "images" if method == "PUT" else "image"
-    files = [(name, (photo.name, photo.read_bytes())) for photo in photos]
+    files = [("images", (photo.name, photo.read_bytes())) for photo in photos]
     return client.request(method, path, files=files, data=fields)
 
 
 def _code(answer: httpx.Response) -> str:
-    try:
-        return str(answer.json()["error"]["code"])
-    except (ValueError, KeyError, TypeError):
-        return f"status {answer.status_code}"
-
-
-def _counts(name: str, fmr: float, attempts: Sequence[_Attempt]) -> Counts:
-    genuine = [attempt.accepted for attempt in attempts if attempt.genuine]
-    impostors = [attempt.accepted for attempt in attempts if not attempt.genuine]
-    return Counts(name, sum(genuine), len(genuine), sum(impostors), len(impostors), fmr)
+    return str(answer.json()["error"]["code"]) if answer.is_error else ""
 
 
 def _erase(client: httpx.Client, name: str, photo: Path) -> tuple[dict[str, Any], list[str]]:
     faults = []
     answer = client.delete(f"/v1/subjects/{name}")
-    if answer.status_code != httpx.codes.OK:
+    if answer.is_error:
         return {}, [f"{name} was not erased: {_code(answer)}"]
     public_key = read_receipt_key(client.get("/v1/contract").json()["receipt_key"])
     claims = verify_answer(answer.json(), public_key)
     if not claims["held"]:
         faults.append("the receipt says that nothing was held")
-    again = _send(client, "POST", f"/v1/subjects/{name}/verify", [photo])
-    if _code(again) != "not_enrolled":
-        faults.append(f"{name} still answers after the erasure: {_code(again)}")
+    if _code(_send(client, "POST", f"/v1/subjects/{name}/verify", [photo])) != "not_enrolled":
+        faults.append(f"{name} still answers after the erasure")
     return claims, faults
 
 

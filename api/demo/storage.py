@@ -41,25 +41,19 @@ def create_key(folder: Path) -> str:
 
 def read_stored(folder: Path, names: Sequence[str]) -> tuple[Stored, ...]:
     """Read the database's file as a thief would, and open it with the master key beside that."""
+    query = "SELECT ciphertext FROM subjects WHERE subject_id = ?"
     stored = []
     with contextlib.closing(_store(folder)) as store:
         for name in names:
             subject = store.subjects.get(TENANT, name)
-            if subject is None:
-                continue
-            query = "SELECT ciphertext FROM subjects WHERE subject_id = ?"
-            ciphertext = bytes(_value(folder, query, name))
-            # From the middle: away from the header and the authentication tag.
-            start = (len(ciphertext) - _EXCERPT) // 2
-            stored.append(
-                Stored(
-                    name=name,
-                    template_bytes=len(subject.wire),
-                    foot_norm=float(wire.decode(subject.wire).subspace.foot_norm),
-                    ciphertext_bytes=len(ciphertext),
-                    ciphertext_excerpt=ciphertext[start : start + _EXCERPT].hex(),
-                )
-            )
+            if subject is not None:
+                ciphertext = bytes(_value(folder, query, name))
+                # From the middle: away from the header and the authentication tag.
+                start = (len(ciphertext) - _EXCERPT) // 2
+                foot_norm = float(wire.decode(subject.wire).subspace.foot_norm)
+                excerpt = ciphertext[start : start + _EXCERPT].hex()
+                row = Stored(name, len(subject.wire), foot_norm, len(ciphertext), excerpt)
+                stored.append(row)
     return tuple(stored)
 
 

@@ -1,19 +1,11 @@
 """Schemathesis against the running service: cases made from its own OpenAPI document.
 
-::
-
-    python -m tests.api.conformance --cases 5000 --out FOLDER
-
-runs all of its checks, with a key that has all rights, with a key that has none but ``verify``, and
-without a key, and prints how many cases each run sent and what failed. ``test_conformance.py`` runs
-a short form of it.
+With a key that has all rights, with a key that has none but ``verify``, and without a key.
 """
 
-import argparse
 import json
 import subprocess
 import sys
-import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -119,34 +111,3 @@ def run_all(server: Server, deployment: Deployment, folder: Path, *, examples: i
         schemathesis(name, server.url, folder, headers=headers, examples=examples, seed=seed)
         for name, headers in callers.items()
     ]
-
-
-def main() -> None:
-    """Run until the cases are at least as many as asked for."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--cases", type=int, default=5000)
-    parser.add_argument("--examples", type=int, default=150, help="for each call, in one run")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--out", type=Path, help="keeps the reports")
-    args = parser.parse_args()
-    total, failed, seed = 0, 0, args.seed
-    with tempfile.TemporaryDirectory() as work:
-        out = args.out or Path(work) / "reports"
-        with service(Path(work)) as (server, deployment):
-            while total < args.cases:
-                for run in run_all(
-                    server, deployment, out / str(seed), examples=args.examples, seed=seed
-                ):
-                    print(f"{run.name} (seed {seed}): {run.cases} cases, exit status {run.status}")
-                    total += run.cases
-                    if run.status:
-                        failed += 1
-                        print(run.output)
-                seed += 1
-            errors = server.log.read_text().count('"internal_error"')
-    print(f"{total} cases in all, {failed} runs with failures, {errors} internal errors")
-    sys.exit(1 if failed or errors else 0)
-
-
-if __name__ == "__main__":
-    main()

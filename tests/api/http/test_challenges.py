@@ -1,7 +1,6 @@
 """Challenges over REST: who passes, what fails and why, and what is used up."""
 
 import base64
-import threading
 from collections.abc import Iterator
 from typing import Any
 
@@ -215,27 +214,6 @@ def test_a_service_without_a_detector_gives_no_challenge(tmp_path: Any) -> None:
             data={"challenge_id": "made-up"},
         )
         assert_error(answer, 422, "validation_failed")
-
-
-def test_of_many_sendings_at_once_one_is_answered(active: Service) -> None:
-    client, _ = active
-    asked = challenge(client)
-    frames = frames_of(performed(asked["movements"]))
-    answers: list[httpx.Response] = []
-    start = threading.Barrier(8)
-
-    def one() -> None:
-        start.wait()
-        answers.append(answered(client, asked["challenge_id"], frames))
-
-    threads = [threading.Thread(target=one) for _ in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert sorted(answer.status_code for answer in answers) == [200] + [401] * 7
-    (accepted,) = (answer for answer in answers if answer.status_code == 200)
-    assert liveness(accepted) == PASSED
 
 
 def test_a_challenge_of_a_token_and_the_token_are_used_up_together(active: Service) -> None:

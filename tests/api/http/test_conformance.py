@@ -1,4 +1,4 @@
-"""A short run of what ``python -m tests.api.conformance`` does at length."""
+"""Schemathesis against the running service."""
 
 from pathlib import Path
 

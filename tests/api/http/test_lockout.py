@@ -7,11 +7,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from api.http.app import create_app
-from api.http.schemas import LockoutAnswer, UnlockAnswer, VerifyAnswer
+from api.http.schemas import LockoutAnswer, UnlockAnswer
 from templates.store.lockout import LockoutPolicy
 from tests.api.calls import AFTER, attempt, enroll, fail
 from tests.api.client import Client
@@ -174,26 +173,3 @@ def test_a_disabled_subject_waits_for_an_operator(
         assert int(answer.headers["retry-after"]) > 0
         assert client.delete("/v1/subjects/alice/lockout").status_code == 200
         assert attempt(client, token, 1).json()["decision"] == "accept"
-
-
-@pytest.mark.parametrize("scores", [True, False])
-def test_hill_climbing_ends_at_the_lockout(both: tuple[Client, Deployment], scores: bool) -> None:
-    """A hill climber gets five answers over REST, and none of them is an accept."""
-    client, deployment = both
-    enroll(client)
-    token = deployment.key("verify", "embeddings", *(["scores", "enroll"] if scores else []))
-    rng, answered = np.random.default_rng(0), 0
-    best, best_score = rng.normal(size=64), -np.inf
-    for _ in range(50):
-        step = best + 0.3 * rng.normal(size=64)
-        probe = (step / np.linalg.norm(step)).astype(np.float32)
-        body = {"embedding": probe.tolist()}
-        answer = client.post("/v1/subjects/alice/verify", json=body, headers=bearer(token))
-        if answer.status_code == 423:
-            continue
-        answered += 1
-        seen = assert_answer(answer, 200, VerifyAnswer)
-        assert seen["decision"] == "reject"
-        if scores and -seen["distance"] > best_score:
-            best, best_score = step, -seen["distance"]
-    assert answered == AFTER

@@ -1,6 +1,5 @@
 """The lowest security level of a deployment and of a key, over REST and on the command line."""
 
-import base64
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -13,18 +12,14 @@ from api.http.app import create_app
 from api.http.errors import StartError
 from api.service.opening import file_sealer, open_keyring, open_store
 from api.service.runtime import Runtime
-from models.pack import ModelPack
-from templates.contract import wire
-from templates.keys.randomness import Keystream
-from templates.space.lifting import lift
 from tests.api.client import Client
-from tests.api.deployment import PROBE_M, Deployment, bearer, deploy, images, photo
+from tests.api.deployment import Deployment, bearer, deploy, images, photo
 from tests.api.shapes import assert_error
 
 LAX, STRICT = "fmr-1e-2", "fmr-1e-3"  # the contract's default is the strict one
 
 Ask = Callable[..., httpx.Response]
-"""Verifies a probe of the person, at a level or at none, with the key of the headers given."""
+"""Verifies a photo of the person, at a level or at none, with the key of the headers given."""
 
 
 def key(deployment: Deployment, lowest_level: str | None) -> dict[str, str]:
@@ -60,43 +55,11 @@ def strict_service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[C
     yield from service(tmp_path_factory.mktemp("strict"), lowest_level=STRICT)
 
 
-def probes(deployment: Deployment) -> dict[str, dict[str, Any]]:
-    """What a request holds for each kind of probe."""
-    assert deployment.settings.pack is not None
-    pack = ModelPack.load(deployment.settings.pack, threads=1)
-    embedding = pack.embed_photo(photo(1, 2), quality=None).embedding
-    lifted = lift(
-        deployment.source.project(embedding[None]),
-        strategy=deployment.contract.binding.strategy,
-        m=PROBE_M,
-        source=deployment.source,
-        stream=Keystream.seeded("probe"),
-    )[0]
-    sent = wire.encode(lifted, contract_id=deployment.contract.contract_id, dtype="float32")
-    return {
-        "photo": {"files": images(photo(1, 2), name="image")},
-        "embedding": {"json": {"embedding": embedding.tolist()}},
-        "template": {"json": {"template": base64.b64encode(sent).decode()}},
-    }
-
-
-@pytest.fixture(params=["photo", "embedding", "template"])
-def kind(request: pytest.FixtureRequest) -> str:
-    return str(request.param)
-
-
-def asker(running: tuple[Client, Deployment], kind: str) -> Ask:
-    client, deployment = running
-    probe = probes(deployment)[kind]
-
+def asker(client: Client) -> Ask:
     def ask(headers: dict[str, str], level: str | None = None) -> Any:
-        if level is None:
-            options = probe
-        elif kind == "photo":
-            options = {**probe, "data": {"level": level}}
-        else:
-            options = {"json": {**probe["json"], "level": level}}
-        return client.post("/v1/subjects/a/verify", headers=headers, **options)
+        fields = {} if level is None else {"level": level}
+        sent = images(photo(1, 2), name="image")
+        return client.post("/v1/subjects/a/verify", headers=headers, files=sent, data=fields)
 
     return ask
 
@@ -107,9 +70,9 @@ def level_of(answer: httpx.Response) -> str:
 
 
 def test_what_is_below_the_level_of_the_deployment_is_forbidden(
-    strict_service: tuple[Client, Deployment], kind: str
+    strict_service: tuple[Client, Deployment],
 ) -> None:
-    ask = asker(strict_service, kind)
+    ask = asker(strict_service[0])
     for lowest_of_key in (None, LAX):
         headers = key(strict_service[1], lowest_of_key)
         for level in (LAX, "accuracy"):
@@ -122,9 +85,9 @@ def test_what_is_below_the_level_of_the_deployment_is_forbidden(
 
 
 def test_what_is_below_the_level_of_the_key_is_forbidden(
-    open_service: tuple[Client, Deployment], kind: str
+    open_service: tuple[Client, Deployment],
 ) -> None:
-    ask = asker(open_service, kind)
+    ask = asker(open_service[0])
     strict, lax, free = (key(open_service[1], name) for name in (STRICT, LAX, None))
     assert assert_error(ask(strict, LAX), 403, "forbidden") == {"lowest_level": STRICT}
     assert level_of(ask(strict)) == STRICT

@@ -75,25 +75,3 @@ def test_who_may_ask(client: Client, deployment: Deployment) -> None:
     assert assert_error(answer, 403, "forbidden") == {"missing": ["enroll", "verify"]}
     nobody = client.post(PATH, files=images(photo(1), name="image"), headers={"Authorization": ""})
     assert_error(nobody, 401, "unauthorized")
-
-
-@pytest.mark.parametrize(
-    ("request_of", "status", "code"),
-    [
-        ({"files": images(b"no picture", name="image")}, 400, "unsupported_image"),
-        ({"files": images(photo(1), photo(1), name="image")}, 413, "too_many_images"),
-        ({"files": images(photo(1), name="images")}, 422, "validation_failed"),
-        ({"files": images(photo(1), name="image"), "data": {"level": "x"}}, 422,
-         "validation_failed"),
-        ({"files": images(photo(1), name="image"), "data": {"face": "x"}}, 422,
-         "validation_failed"),
-        ({"json": {"image": "x"}}, 400, "malformed_request"),
-        ({"content": b"x", "headers": {"Content-Type": "multipart/form-data"}}, 400,
-         "malformed_request"),
-    ],
-)  # fmt: skip
-def test_what_is_no_photo_is_an_error_as_elsewhere(
-    client: Client, request_of: dict[str, Any], status: int, code: str
-) -> None:
-    headers = {**client.headers, **request_of.pop("headers", {})}
-    assert_error(client.post(PATH, headers=headers, **request_of), status, code)

@@ -1,14 +1,11 @@
 """``If-None-Match`` and ``If-Match`` of an enrollment, on both databases."""
 
-from concurrent.futures import ThreadPoolExecutor
-
 import pytest
 from httpx import Response
 
 from api.http.schemas import EnrollmentAnswer, ImportAnswer, SubjectAnswer
-from tests.api.calls import b64, lifted
 from tests.api.client import Client
-from tests.api.deployment import Deployment, codes, images, photo
+from tests.api.deployment import Deployment, images, photo
 from tests.api.shapes import assert_answer, assert_error
 
 NEVER = {"If-None-Match": "*"}
@@ -82,23 +79,6 @@ def test_an_erasure_does_not_pass_over_them(
     assert details == {"field": "If-Match, If-None-Match"}
     assert template_id(client, "ann")
     assert client.delete("/v1/subjects/ann").status_code == 200
-
-
-def test_of_many_at_once_one_enrolls(both: tuple[Client, Deployment]) -> None:
-    client, deployment = both
-    deployment.allow_templates()
-    body = {"template": b64(lifted(deployment))}
-
-    def send(headers: dict[str, str]) -> list[int]:
-        with ThreadPoolExecutor(6) as threads:
-            sendings = [
-                threads.submit(client.put, path("ann"), json=body, headers=headers)
-                for _ in range(6)
-            ]
-            return sorted(codes(sending.result() for sending in sendings))
-
-    assert send(NEVER) == [201, 409, 409, 409, 409, 409]
-    assert send(only(template_id(client, "ann"))) == [200, 409, 409, 409, 409, 409]
 
 
 @pytest.mark.parametrize(

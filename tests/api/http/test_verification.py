@@ -163,16 +163,14 @@ def test_hostile_embeddings(client: Client, sender: str) -> None:
         {"0": 1.0},
         7,
     ]
-    import json
-
-    for case in cases:
-        answer = ask(
-            client,
-            sender,
-            content=json.dumps({"embedding": case}),
-            headers={"Content-Type": "application/json"},
-        )
-        assert_error(answer, 400, "invalid_embedding")
+    bursts: list[Any] = [
+        *([], good, [[]], [good, good[:-1]], [good, None], [good, [True, *good[1:]]], [[good]]),
+        *([good] * 6, [good, [0.0] * N], [good, [1.01 * x for x in good]], {"0": good}, "AAAA"),
+    ]
+    for field, tried in (("embedding", cases), ("embeddings", bursts)):
+        for case in tried:
+            answer = ask(client, sender, json={field: case})
+            assert_error(answer, 400, "invalid_embedding")
 
 
 def test_hostile_lifted_probes(client: Client, sender: str, deployment: Deployment) -> None:
