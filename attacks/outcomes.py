@@ -68,30 +68,14 @@ class KnowledgeLevel(StrEnum):
 
 @dataclass(frozen=True)
 class Knowledge:
-    """What an attack takes: one template, unless it says otherwise, and these.
+    """What an attack takes: one template, unless it says otherwise, and these."""
 
-    Parameters
-    ----------
-    template
-        False where nothing needs to be stolen.
-    several
-        Several templates of one person.
-    generator
-        How templates are lifted, the model and the decoy generator, which clients have.
-    faces
-        Photos of other people.
-    lifting
-        To lift faces as the service does, which of a pool takes the pool.
-    pool
-        The decoy pool.
-    """
-
-    template: bool = True
-    several: bool = False
-    generator: bool = False
-    faces: bool = False
-    lifting: bool = False
-    pool: bool = False
+    template: bool = True  # false where nothing needs to be stolen
+    several: bool = False  # several templates of one person
+    generator: bool = False  # how templates are lifted, the model and the generator, as clients
+    faces: bool = False  # photos of other people
+    lifting: bool = False  # to lift faces as the service does, which of a pool takes the pool
+    pool: bool = False  # the decoy pool
 
     def level(self, scheme: "Scheme") -> KnowledgeLevel:
         """Return the column of the report, for templates of a scheme."""
@@ -111,24 +95,12 @@ RAW = "raw"
 
 @dataclass(frozen=True)
 class Scheme:
-    """A way of protecting embeddings.
+    """A way of protecting embeddings."""
 
-    Parameters
-    ----------
-    strategy
-        A ``templates.space.lifting.Strategy``, or ``raw``.
-    decoys
-        ``pool`` or ``generator``; None where the strategy takes none.
-    dim
-        m; 0 for raw embeddings.
-    axes
-        Numbers of what is lifted, k; None where embeddings are not projected.
-    """
-
-    strategy: str
-    decoys: str | None
-    dim: int
-    axes: int | None = None
+    strategy: str  # a ``templates.space.lifting.Strategy``, or ``raw``
+    decoys: str | None  # ``pool`` or ``generator``; None where the strategy takes none
+    dim: int  # m; 0 for raw embeddings
+    axes: int | None = None  # numbers of what is lifted, k; None where that is not projected
 
     def __str__(self) -> str:
         if self.strategy == RAW:
@@ -158,21 +130,13 @@ RAW_SCHEME = Scheme(RAW, None, 0)
 
 @dataclass(frozen=True)
 class Estimate:
-    """A measure that is no count, with its 95 % interval.
-
-    Parameters
-    ----------
-    trials
-        Number of scores that it rests on.
-    interval
-        How the bounds were computed.
-    """
+    """A measure that is no count, with its 95 % interval."""
 
     value: float
     ci_low: float
     ci_high: float
-    trials: int
-    interval: str
+    trials: int  # number of scores that it rests on
+    interval: str  # how the bounds were computed
 
     def to_json(self) -> dict[str, Json]:
         """JSON form."""
@@ -184,39 +148,22 @@ Measured: TypeAlias = Rate | Estimate
 
 @dataclass(frozen=True, kw_only=True)
 class AttackOutcome:
-    """One attack on one scheme.
+    """One attack on one scheme."""
 
-    Parameters
-    ----------
-    attack
-        Its name, such as ``foot-point``; one name has one meaning in all reports.
-    variant
-        What distinguishes it from the other outcomes of this attack on this scheme; may be empty.
-    assumption
-        One sentence: what the attacker has and does, and what counts as success.
-    level
-        The security level that success is judged at, such as ``fmr-1e-3``; None where none is.
-    chance
-        How often guessing would have: the level's FMR, or the majority class.
-    unjudged
-        Why the verdict does not count it, as the end of a sentence that begins "not judged:";
-        None where it does. ``CONTROL`` for a control, ``COMPARED`` where it is not of the audited
-        scheme.
-    details
-        Further figures, JSON values. Never a number of an embedding or a template.
-    """
-
-    attack: str
-    variant: str = ""
+    attack: str  # its name, such as ``foot-point``; one name has one meaning in all reports
+    variant: str = ""  # what distinguishes it from this attack's other outcomes on this scheme
     breaks: Property
     leaked: Leaked
     knowledge: KnowledgeLevel
-    assumption: str
+    assumption: str  # what the attacker has and does, and what counts as success, in a sentence
     scheme: Scheme
-    level: str | None = None
+    level: str | None = None  # that success is judged at, such as ``fmr-1e-3``
     measured: Measured
-    chance: float
+    chance: float  # how often guessing would succeed: the level's FMR, or the majority class
+    # Why the verdict does not count it, as the end of a sentence that begins "not judged:"; None
+    # where it does. ``CONTROL`` for a control, ``COMPARED`` where it is not of the audited scheme.
     unjudged: str | None = None
+    # Further figures. Never a number of an embedding or a template.
     details: Mapping[str, Json] = field(default_factory=dict)
 
     @property

@@ -79,7 +79,6 @@ class CalibrationReport:
     """Sentences about the FMR targets that the data cannot resolve."""
     left_out: list[str] = field(default_factory=list)
     """Sentences about the groups whose trials are too few for ``worst_group`` to heed them."""
-    ten_folds: list[TenFold] = field(default_factory=list)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -211,7 +210,6 @@ def _calibration(
         "impostor_people_pairs": impostors.person_pairs,
     }
     if folds is not None:
-        run.report.ten_folds.append(folds)
         facts["ten_fold_accuracy"] = folds.accuracy_mean
         facts["ten_fold_std"] = folds.accuracy_std
     where = (

@@ -4,10 +4,8 @@ Columns are ``file,age,gender,race,service_test``; ``file`` is a path relative t
 label file. Spreadsheets turn the ages 3-9 and 10-19 into dates; those are repaired here.
 """
 
-from dataclasses import dataclass
 from pathlib import Path
 
-from templates.decoys import Attributes
 from verify.datasets import DatasetError, csv_rows, decoded, read_whole
 
 AGES = ("0-2", "3-9", "10-19", "20-29", "30-39", "40-49", "50-59", "60-69", "more than 70")
@@ -17,7 +15,6 @@ RACES = (
     *("Black", "White", "Indian"),
 )
 CLASSES = {"gender": GENDERS, "race": RACES, "age": AGES}
-_NEEDED = ("file", "age", "gender", "race")
 _MAX_BYTES = 64 * 2**20
 # 3-9 read as a date is 3 September or 9 March; 10-19 is 19 October or October (20)19.
 _DATES = {
@@ -39,20 +36,6 @@ def repaired_age(text: str) -> str | None:
     return plain if plain in AGES else _DATES.get(plain.lower())
 
 
-@dataclass(frozen=True)
-class Label:
-    """The labels of one photo; ``age`` is one of ``AGES``."""
-
-    age: str
-    gender: str
-    race: str
-
-    @property
-    def attributes(self) -> Attributes:
-        """What lifting may ask for."""
-        return Attributes(gender=self.gender, race=self.race)
-
-
 def label_files(source: Path) -> list[Path]:
     """Label files of a photo folder: inside it, or beside it."""
     return [
@@ -61,22 +44,17 @@ def label_files(source: Path) -> list[Path]:
     ]
 
 
-def read_labels(file: Path) -> dict[Path, Label]:
-    """Read a label file: labels by the resolved path of the photo."""
+def read_labels(file: Path) -> dict[Path, dict[str, str]]:
+    """Read a label file: by the resolved path of a photo, its age, gender and race."""
     folder = file.resolve().parent
     text = decoded(read_whole(file, most=_MAX_BYTES), file=file)
     labels = {}
-    for where, row in csv_rows(file, text, required=_NEEDED):
-        label = _label(row, where=where)
-        labels[(folder / row["file"]).resolve()] = label
+    for where, row in csv_rows(file, text, required=("file", *CLASSES)):
+        if not row["file"].isprintable():
+            raise DatasetError(f"{where}: the name of the file is not printable")
+        row["age"] = repaired_age(row["age"]) or row["age"]
+        for name, known in CLASSES.items():
+            if row[name] not in known:
+                raise DatasetError(f"{where}: the {name} is none of {', '.join(known)}")
+        labels[(folder / row["file"]).resolve()] = {name: row[name] for name in CLASSES}
     return labels
-
-
-def _label(row: dict[str, str], *, where: str) -> Label:
-    if not row["file"].isprintable():
-        raise DatasetError(f"{where}: the file has a name with characters that are not printable")
-    row["age"] = repaired_age(row["age"]) or row["age"]
-    for name, known in CLASSES.items():
-        if row[name] not in known:
-            raise DatasetError(f"{where}: the {name} is none of {', '.join(known)}")
-    return Label(age=row["age"], gender=row["gender"], race=row["race"])

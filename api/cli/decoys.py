@@ -15,7 +15,7 @@ from api.cli.photo_folders import photos_of
 from api.cli.results import Result
 from api.settings import Settings
 from models.extraction import Extraction
-from templates.decoys import DecoyGenerator
+from templates.decoys import Attributes, DecoyGenerator
 from templates.decoys.fitting import FACES_PER_DIMENSION
 from verify.fairface_labels import label_files, read_labels
 from verify.preparation import LikeSample, acquired, acquired_json, make_generator, make_pool
@@ -89,7 +89,9 @@ def build(
     else:
         files = [file for folder in photos for file in label_files(folder)]
         labels = {
-            path: label.attributes for file in files for path, label in read_labels(file).items()
+            path: Attributes(gender=label["gender"], race=label["race"])
+            for file in files
+            for path, label in read_labels(file).items()
         }
         pool = make_pool(extraction, labels or None, pack)
         pool.save(path, bulk.sealer)

@@ -21,7 +21,7 @@ from attacks.outcomes import (
 from models.extraction import Extraction
 from templates.decoys import DecoyGenerator
 from templates.decoys.fitting import MIN_DESCRIPTORS
-from verify.fairface_labels import CLASSES, Label
+from verify.fairface_labels import CLASSES
 from verify.own_decoys import require_others
 
 PAPER_LIFTING = 10_000
@@ -41,11 +41,11 @@ def default_lifting(training: int) -> int:
     return min(PAPER_LIFTING, max(MIN_DESCRIPTORS, int(LIFTING_SHARE * training)))
 
 
-def labelled_faces(photos: Extraction, labels: Mapping[Path, Label]) -> LabelledFaces:
+def labelled_faces(photos: Extraction, labels: Mapping[Path, Mapping[str, str]]) -> LabelledFaces:
     """Join the photos that were embedded with their labels."""
     return LabelledFaces.of_names(
         photos.embeddings,
-        {name: [str(getattr(labels[path], name)) for path in photos.paths] for name in CLASSES},
+        {name: [labels[path][name] for path in photos.paths] for name in CLASSES},
         CLASSES,
     )
 

@@ -15,9 +15,10 @@ from attacks.second_order import Moments, decoy_moment, drawn_towards
 from templates.decoys import DecoyGenerator, DecoyPool
 from templates.decoys.source import DecoySource
 from templates.space.lifting import Strategy
-from verify.fairface_labels import Label
 
 Codes = NDArray[np.int64]
+Labels = Mapping[Path, Mapping[str, str]]
+"""Gender, race and age by the path of a photo."""
 
 PAPER_DIMS = (2, 4, 8, 16)
 OUR_DIMS = (2, 4, 8, 16, 32, 64)
@@ -64,9 +65,7 @@ class AttributePlan:
         """Times that each of so many own faces is lifted."""
         return min(max(self.training_most // max(faces, 1), 1), _MOST_LIFTS)
 
-    def sample(
-        self, train: Mapping[Path, Label], validation: Mapping[Path, Label]
-    ) -> tuple[Mapping[Path, Label], Mapping[Path, Label]]:
+    def sample(self, train: Labels, validation: Labels) -> tuple[Labels, Labels]:
         """Choose the photos that take part, so that no others are embedded.
 
         A face costs a hundred times what an attack on it does.
@@ -118,7 +117,7 @@ class AttributePlan:
         return faces
 
 
-def _sample(labels: Mapping[Path, Label], most: int | None, seed: int) -> Mapping[Path, Label]:
+def _sample(labels: Labels, most: int | None, seed: int) -> Labels:
     """Choose at most so many photos at random; all where None."""
     if most is None or most >= len(labels):
         return labels

@@ -187,11 +187,10 @@ def test_ten_fold_adds_the_accuracy_level(people: People) -> None:
     result = calibrate_people(people, options=options)
     calibration = result.contract.calibrations[0]
     level = calibration.level(ACCURACY_LEVEL)
-    (folds,) = result.report.ten_folds
     assert level.target_fmr is None
-    assert level.threshold == pytest.approx(np.mean(folds.thresholds))
-    assert calibration.calibrated_on["ten_fold_accuracy"] == pytest.approx(folds.accuracy_mean)
-    assert folds.accuracy_mean > 0.95
+    accuracy = calibration.calibrated_on["ten_fold_accuracy"]
+    assert isinstance(accuracy, float)
+    assert accuracy > 0.95
     other = calibration.level("fmr-1e-2")
     assert (level.fmr.value < other.fmr.value) == (level.threshold > other.threshold)
 
