@@ -31,6 +31,11 @@ class Face:
     score: float
     keypoints: NDArray[np.float32]
 
+    def moved(self, offset: NDArray[np.float32], scale: NDArray[np.float32]) -> "Face":
+        """The face in a picture that begins at ``offset`` of this one, and is ``scale`` finer."""
+        corners = (self.box.reshape(2, 2) - offset) / scale
+        return Face(corners.reshape(4), self.score, (self.keypoints - offset) / scale)
+
     @property
     def width(self) -> float:
         """Width of the box in pixels."""
@@ -47,17 +52,18 @@ class Face:
         return max(self.width, 0.0) * max(self.height, 0.0)
 
 
-def centre_rank(face: Face, image_shape: tuple[int, ...]) -> float:
-    """Rank of a face as the one that is meant: ``area - 2 * ‖box centre - image centre‖²``."""
-    height, width = image_shape[:2]
-    dx = float(face.box[0] + face.box[2]) / 2 - width / 2
-    dy = float(face.box[1] + face.box[3]) / 2 - height / 2
-    return face.area - 2 * (dx * dx + dy * dy)
-
-
 def ranked(faces: Sequence[Face], image_shape: tuple[int, ...]) -> list[Face]:
-    """Faces, the one that is most likely meant first."""
-    return sorted(faces, key=lambda face: centre_rank(face, image_shape), reverse=True)
+    """Faces, the one that is most likely meant first.
+
+    The rank is InsightFace's, ``area - 2 * ‖box centre - image centre‖²``.
+    """
+    middle = np.array([image_shape[1], image_shape[0]]) / 2
+
+    def rank(face: Face) -> float:
+        distance = (face.box[:2] + face.box[2:]) / 2 - middle
+        return face.area - 2 * float(distance @ distance)
+
+    return sorted(faces, key=rank, reverse=True)
 
 
 def intersection_over_union(first: NDArray[np.float32], second: NDArray[np.float32]) -> float:

@@ -1,7 +1,7 @@
 """What every face detector does alike: the canvas, and which canvas speaks for which face."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import cv2
 import numpy as np
@@ -35,6 +35,10 @@ _LEAST_SPREAD = 1.0
 Size = tuple[int, int]  # height, width
 
 
+Candidates = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
+"""Boxes (k, 4), scores (k,) and points (k, 5, 2) of one stride, in pixels of the canvas."""
+
+
 class Detector(ABC):
     """A face detector with five points per face.
 
@@ -44,6 +48,11 @@ class Detector(ABC):
         A graph with one image input.
     size
         Side of the canvas, a multiple of 32, where the graph does not fix it.
+
+    Attributes
+    ----------
+    sizes
+        The main canvas and, below it, the near one; only the graph's own where it has one.
     """
 
     kind: str
@@ -52,37 +61,61 @@ class Detector(ABC):
     """For photos of a person who wants to be seen."""
     clear_score: float
     """What nearly every upright face reaches that nothing covers, and no turned one does."""
+    overlap: float
+    """Share from which on two boxes are one face."""
+    enlarges: bool
+    """Whether a picture that is smaller than the canvas is enlarged to fill it."""
 
     def __init__(self, session: Session, *, size: int = DEFAULT_SIZE) -> None:
         self._session = session
-        self._input_name = session.inputs[0].name
         height, width = session.inputs[0].shape[2:]
         self.is_fixed = height is not None and width is not None
-        fixed = None if height is None or width is None else (height, width)
-        self.sizes = canvas_sizes(size, fixed)
+        self.sizes: tuple[Size, ...] = ((size, size),)
+        if height is not None and width is not None:
+            self.sizes = ((height, width),)
+        elif size > NEAR_SIZE:
+            self.sizes = ((size, size), (NEAR_SIZE, NEAR_SIZE))
 
     def canvas(self, image: NDArray[np.uint8], size: Size) -> Size:  # noqa: ARG002 - of some kinds
         """The canvas that a pass of ``size`` really takes for ``image``."""
         return size
 
     @abstractmethod
+    def candidates(self, canvas: NDArray[np.uint8]) -> Iterable[Candidates]:
+        """What reaches the threshold of scores on a canvas (h, w, 3), by stride."""
+
     def detect_once(self, image: NDArray[np.uint8], size: Size) -> list[Face]:
-        """Faces found in one pass on a canvas of ``size``, in pixels of ``image``."""
+        """Faces found in one pass on a canvas of ``size``, in pixels of ``image``.
 
-    def _misfit(self, stride: int, size: Size) -> ModelError:
-        return ModelError(
-            f"{self._session.name}: the outputs at stride {stride} do not fit a"
-            f" {size[1]} x {size[0]} canvas."
-        )
+        Candidates that are not finite, empty, or whose points coincide are dropped.
+        """
+        canvas, scale = letterbox(image, self.canvas(image, size), enlarge=self.enlarges)
+        strides = zip(*self.candidates(canvas), strict=True)
+        boxes, scores, points = (np.concatenate(values) for values in strides)
+        # A wild regression must not reach the alignment, which divides by the spread of the points.
+        with np.errstate(invalid="ignore", over="ignore"):
+            sound = (
+                np.isfinite(boxes).all(axis=1)
+                & np.isfinite(points).all(axis=(1, 2))
+                & (boxes[:, 2:] > boxes[:, :2]).all(axis=1)
+                & (np.ptp(points, axis=1).max(axis=1) > _LEAST_SPREAD)
+            )
+        boxes, scores, points = boxes[sound] / scale, scores[sound], points[sound] / scale
+        kept = non_maximum_suppression(boxes, scores, threshold=self.overlap)
+        return [Face(boxes[i], float(scores[i]), points[i]) for i in kept]
 
+    def run(
+        self, blob: NDArray[np.float32], outputs: Sequence[str] | None = None
+    ) -> list[NDArray[np.float32]]:
+        """Run the graph on one canvas, (1, 3, h, w)."""
+        return self._session.run({self._session.inputs[0].name: blob}, outputs)
 
-def canvas_sizes(size: int, fixed: Size | None) -> tuple[Size, ...]:
-    """The main canvas and, below it, the near one; only the graph's own where it has one."""
-    if fixed is not None:
-        return (fixed,)
-    if size <= NEAR_SIZE:
-        return ((size, size),)
-    return ((size, size), (NEAR_SIZE, NEAR_SIZE))
+    def require_fit(self, fits: bool, stride: int) -> None:
+        """Refuse outputs that are not those of a canvas."""
+        if not fits:
+            raise ModelError(
+                f"{self._session.name}: the outputs at stride {stride} do not fit the canvas."
+            )
 
 
 def find_faces(detector: Detector, image: NDArray[np.uint8]) -> list[Face]:
@@ -133,9 +166,9 @@ def _large_faces(detector: Detector, image: NDArray[np.uint8]) -> list[Face]:
     height, width = (max(1, round(side * shrink)) for side in small.shape[:2])
     # The last half by areas: single pixels of a grainy photo are noise.
     small = np.asarray(cv2.resize(small, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
-    scale = np.array([image.shape[1] / width, image.shape[0] / height], dtype=np.float32)
+    scale = np.array([width / image.shape[1], height / image.shape[0]], dtype=np.float32)
     return [
-        Face(face.box * np.tile(scale, 2), face.score, face.keypoints * scale)
+        face.moved(np.zeros(2, np.float32), scale)
         for face in detector.detect_once(small, (SCOUT_SIZE, SCOUT_SIZE))
         if _longer_side(face) >= LARGE_SHARE * max(height, width)
     ]
@@ -160,16 +193,8 @@ def _inside_border(detector: Detector, image: NDArray[np.uint8], main: Size) -> 
     pad_x = round(round(width * RETRY_BORDER) * fx)
     bordered = cv2.copyMakeBorder(small, pad_y, pad_y, pad_x, pad_x, cv2.BORDER_CONSTANT)
     faces = detector.detect_once(np.asarray(bordered, dtype=np.uint8), main)
-    scale = np.array([fx, fy], dtype=np.float32)
-    offset = np.array([pad_x, pad_y], dtype=np.float32)
-    return [
-        Face(
-            box=((face.box.reshape(2, 2) - offset) / scale).reshape(4),
-            score=face.score,
-            keypoints=(face.keypoints - offset) / scale,
-        )
-        for face in faces
-    ]
+    offset, scale = np.array([[pad_x, pad_y], [fx, fy]], dtype=np.float32)
+    return [face.moved(offset, scale) for face in faces]
 
 
 def quarter_turns(detector: Detector, crop: NDArray[np.uint8]) -> int:
@@ -257,43 +282,7 @@ def channels_first(
     return blob
 
 
-def cell_corners(
-    cells: NDArray[np.intp], columns: int, *, stride: int, per_cell: int = 1
-) -> NDArray[np.float32]:
+def cell_corners(cells: NDArray[np.intp], columns: int, *, stride: int) -> NDArray[np.float32]:
     """Top-left corners of grid cells in pixels, (k, 2), by their numbers, row by row."""
-    y, x = np.divmod(cells // per_cell, columns)
+    y, x = np.divmod(cells, columns)
     return np.stack([x, y], axis=1).astype(np.float32) * np.float32(stride)
-
-
-def faces_from_candidates(
-    boxes: Sequence[NDArray[np.float32]],
-    scores: Sequence[NDArray[np.float32]],
-    keypoints: Sequence[NDArray[np.float32]],
-    *,
-    overlap: float,
-    scale: float,
-) -> list[Face]:
-    """Join the candidates of all strides, suppress duplicates, return to image pixels.
-
-    Candidates that are not finite, empty, or whose points coincide are dropped.
-    """
-    all_boxes, all_scores = np.concatenate(boxes), np.concatenate(scores)
-    all_points = np.concatenate(keypoints)
-    # A wild regression must not reach the alignment, which divides by the spread of the points.
-    with np.errstate(invalid="ignore", over="ignore"):
-        sound = (
-            np.isfinite(all_boxes).all(axis=1)
-            & np.isfinite(all_points).all(axis=(1, 2))
-            & (all_boxes[:, 2:] > all_boxes[:, :2]).all(axis=1)
-            & (np.ptp(all_points, axis=1).max(axis=1) > _LEAST_SPREAD)
-        )
-    all_boxes, all_scores, all_points = all_boxes[sound], all_scores[sound], all_points[sound]
-    kept = non_maximum_suppression(all_boxes, all_scores, threshold=overlap)
-    return [
-        Face(
-            box=np.asarray(all_boxes[i] / scale, dtype=np.float32),
-            score=float(all_scores[i]),
-            keypoints=np.asarray(all_points[i] / scale, dtype=np.float32),
-        )
-        for i in kept
-    ]

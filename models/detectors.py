@@ -1,25 +1,17 @@
 """SCRFD, the detector of the InsightFace packs, and YuNet, that of the OpenCV Zoo."""
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
-from models.boxes import Face
-from models.detection import (
-    Detector,
-    Size,
-    cell_corners,
-    channels_first,
-    faces_from_candidates,
-    letterbox,
-)
+from models.detection import Candidates, Detector, Size, cell_corners, channels_first
 from models.errors import ModelError
 
 STRIDES = (8, 16, 32)
 YUNET_OUTPUTS = tuple(
     f"{role}_{stride}" for role in ("cls", "obj", "bbox", "kps") for stride in STRIDES
 )
-_SCRFD_OVERLAP = 0.4
-_YUNET_OVERLAP = 0.3
 # exp of a wild regression must not overflow; 2**10 strides exceed any canvas.
 _MAX_LOG_SIDE = 7.0
 
@@ -39,27 +31,27 @@ class Scrfd(Detector):
     score_threshold = 0.5
     recommended_score = 0.6
     clear_score = 0.75
+    overlap = 0.4
+    enlarges = True
 
-    def detect_once(self, image: NDArray[np.uint8], size: Size) -> list[Face]:
-        """Faces found in one pass on a canvas of ``size``, in pixels of ``image``."""
-        canvas, scale = letterbox(image, size, enlarge=True)
+    def candidates(self, canvas: NDArray[np.uint8]) -> Iterator[Candidates]:
+        """What reaches the threshold of scores on a canvas (h, w, 3), by stride."""
         blob = channels_first(canvas)
         blob -= np.float32(127.5)
         blob *= np.float32(1 / 128)
-        outputs = self._session.run({self._input_name: blob})
-        boxes, scores, keypoints = [], [], []
-        for stride, (score, distance, point) in zip(STRIDES, _by_stride(outputs), strict=True):
-            rows, columns = size[0] // stride, size[1] // stride
+        by_stride = _by_stride(self.run(blob))
+        for stride, (score, distance, point) in zip(STRIDES, by_stride, strict=True):
+            rows, columns = canvas.shape[0] // stride, canvas.shape[1] // stride
             per_cell, rest = divmod(len(score), rows * columns)
-            if rest or per_cell == 0 or len(distance) != len(score) or len(point) != len(score):
-                raise self._misfit(stride, size)
+            self.require_fit(
+                per_cell > 0 and not rest and len(score) == len(distance) == len(point), stride
+            )
             cells = np.flatnonzero(score >= self.score_threshold)
-            centres = cell_corners(cells, columns, stride=stride, per_cell=per_cell)
+            centres = cell_corners(cells // per_cell, columns, stride=stride)
             reach = distance[cells] * stride
-            boxes.append(np.concatenate([centres - reach[:, :2], centres + reach[:, 2:]], axis=1))
-            scores.append(score[cells])
-            keypoints.append(centres[:, None, :] + point[cells].reshape(-1, 5, 2) * stride)
-        return faces_from_candidates(boxes, scores, keypoints, overlap=_SCRFD_OVERLAP, scale=scale)
+            boxes = np.concatenate([centres - reach[:, :2], centres + reach[:, 2:]], axis=1)
+            points = centres[:, None, :] + point[cells].reshape(-1, 5, 2) * stride
+            yield boxes, score[cells], points
 
 
 def _by_stride(
@@ -96,42 +88,32 @@ class YuNet(Detector):
     score_threshold = 0.6
     recommended_score = 0.7
     clear_score = 0.92
+    overlap = 0.3
+    enlarges = False
 
     def canvas(self, image: NDArray[np.uint8], size: Size) -> Size:
-        """Canvas of a pass: no larger than the picture needs, unless the graph fixes it."""
-        return size if self.is_fixed else _trimmed(image, size)
+        """Smallest canvas of whole 32-pixel blocks that holds the picture, at most ``size``."""
+        if self.is_fixed:
+            return size
+        height, width = image.shape[:2]
+        scale = min(size[0] / height, size[1] / width, 1.0)
+        rows, columns = (-(-round(side * scale) // 32) * 32 for side in (height, width))
+        return min(size[0], max(32, rows)), min(size[1], max(32, columns))
 
-    def detect_once(self, image: NDArray[np.uint8], size: Size) -> list[Face]:
-        """Faces found in one pass on a canvas of ``size``, in pixels of ``image``."""
-        size = self.canvas(image, size)
-        canvas, scale = letterbox(image, size, enlarge=False)
-        blob = channels_first(canvas, (2, 1, 0))
-        answers = self._session.run({self._input_name: blob}, YUNET_OUTPUTS)
+    def candidates(self, canvas: NDArray[np.uint8]) -> Iterator[Candidates]:
+        """What reaches the threshold of scores on a canvas (h, w, 3), by stride."""
+        answers = self.run(channels_first(canvas, (2, 1, 0)), YUNET_OUTPUTS)
         outputs = dict(zip(YUNET_OUTPUTS, answers, strict=True))
-        boxes, scores, keypoints = [], [], []
         for stride in STRIDES:
-            rows, columns = size[0] // stride, size[1] // stride
-            cls = outputs[f"cls_{stride}"].reshape(-1)
-            if len(cls) != rows * columns:
-                raise self._misfit(stride, size)
-            obj = outputs[f"obj_{stride}"].reshape(-1)
+            rows, columns = canvas.shape[0] // stride, canvas.shape[1] // stride
+            cls, obj = (outputs[f"{role}_{stride}"].reshape(-1) for role in ("cls", "obj"))
+            self.require_fit(len(cls) == rows * columns, stride)
             score = np.sqrt(np.clip(cls, 0, 1) * np.clip(obj, 0, 1))
             cells = np.flatnonzero(score >= self.score_threshold)
             corner = cell_corners(cells, columns, stride=stride)
             box = outputs[f"bbox_{stride}"].reshape(-1, 4)[cells]
             centre = corner + box[:, :2] * stride
             half = np.exp(np.minimum(box[:, 2:], _MAX_LOG_SIDE)) * (stride / 2)
-            boxes.append(np.concatenate([centre - half, centre + half], axis=1))
-            scores.append(score[cells])
             points = outputs[f"kps_{stride}"].reshape(-1, 5, 2)[cells]
-            keypoints.append(corner[:, None, :] + points * stride)
-        return faces_from_candidates(boxes, scores, keypoints, overlap=_YUNET_OVERLAP, scale=scale)
-
-
-def _trimmed(image: NDArray[np.uint8], size: Size) -> Size:
-    """Smallest canvas of whole 32-pixel blocks that holds the picture, at most ``size``."""
-    scale = min(size[0] / image.shape[0], size[1] / image.shape[1], 1.0)
-    return (
-        min(size[0], max(32, -(-round(image.shape[0] * scale) // 32) * 32)),
-        min(size[1], max(32, -(-round(image.shape[1] * scale) // 32) * 32)),
-    )
+            boxes = np.concatenate([centre - half, centre + half], axis=1)
+            yield boxes, score[cells], corner[:, None, :] + points * stride

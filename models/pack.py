@@ -156,7 +156,7 @@ class ModelPack:
         return self._embedder.preprocessing.size
 
     def detect(self, image: NDArray[np.uint8]) -> list[Face]:
-        """Faces of an RGB image, the one most likely meant first (`boxes.centre_rank`)."""
+        """Faces of an RGB image, the one most likely meant first (`boxes.ranked`)."""
         if self._detector is None:
             raise PackError(
                 f"The pack {self.info.name} has no detector; add a SCRFD or YuNet .onnx file to"
