@@ -2,16 +2,16 @@
 
 It lets ``veilface demo`` and the tests run the whole service on a clone that has no weights. It
 looks at the direction of edges around each place of the picture (a histogram of oriented
-gradients, made independent of the light by the contrast around the place), takes off what a drawn
-face has on average, and projects the rest with fixed random signs to 256 numbers. No weight is
-learnt, and nothing has seen a real face.
+gradients, made independent of the light by the contrast around the place), takes off what the
+picture has of a direction everywhere, and projects the rest with fixed random signs to 256 numbers.
+No weight is learnt, and nothing has seen a real face.
 
 **Demo model: not for authentication.** On photos of real people it is little more than a
 comparison of pictures.
 
-It has no detector, because drawn faces come aligned. In its place :func:`require_face` holds the
-edges of a picture against those of the average drawn face, so that a picture of something else is
-refused as one without a face.
+It has no detector, because drawn faces come aligned. In its place :func:`require_face` holds an
+embedding against the mean of drawn faces, so that a picture of something else is refused as one
+without a face.
 """
 
 import hashlib
@@ -20,18 +20,18 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-import onnxruntime as ort
 from numpy.typing import NDArray
 
 from models.errors import NoFace
-from models.synthetic import draw_people
 
 DEMO_NOTICE = "demo model: not for authentication"
 DEMO_DIMENSION = 256
 DEMO_FILE = "demo.onnx"
+AVERAGED = range(10_000_000, 10_000_064)
+"""People whom no demo and no test enrolls: the mean of their embeddings is a drawn face's."""
 
 _SIDE = 112
-_DIRECTIONS = 8
+_DIRECTIONS = 4
 _SIGMA = 1.2  # width of the edge filters in pixels
 _REACH = 4
 _CELL = 8  # an edge counts for all cells of 8 x 8 pixels that hold it; cells start every 4 pixels
@@ -40,11 +40,8 @@ _CELLS = (_SIDE - _CELL) // _STRIDE + 1
 _FLAT = 9e-4  # squared contrast below which a cell is sensor noise: (0.03)^2 on a scale of -1 to 1
 _CENTRE = (56.0, 62.0)  # of the window that keeps background and most hair out
 _WINDOW = (30.0, 42.0)
-_LEAST_ALIKE = 0.34  # cosine to the average face; tests/models/test_demo.py measures both sides
-_AVERAGED = range(10_000_000, 10_000_024)  # people whom no demo and no test enrolls
+_LEAST_ALIKE = 0.31  # cosine to the mean; tests/models/test_demo.py measures both sides
 _GRID = 1 / 4096  # constants are rounded to it, so that no bit depends on a machine's libm
-
-Constants = Mapping[str, NDArray[np.generic]]
 
 
 def build_demo_pack(folder: Path) -> Path:
@@ -61,13 +58,31 @@ def build_demo_pack(folder: Path) -> Path:
 @cache
 def demo_model_bytes() -> bytes:
     """Build the ONNX file: the same bytes each time, since its SHA-256 stands in contracts."""
-    constants = {
-        **_feature_constants(),
-        "average": np.asarray(-_average_features(), np.float32),
+    cell, step, around = [_CELL] * 2, [_STRIDE] * 2, [3, 3]
+    nodes = [
+        _node("Conv", ["image", "edges"], "slopes", pads=[_REACH] * 4),
+        # Which side of an edge is the darker one is an accident of hair and background.
+        _node("Abs", ["slopes"], "steep"),
+        _node("AveragePool", ["steep"], "cells", kernel_shape=cell, strides=step),
+        _node("ReduceSumSquare", ["cells"], "energy", axes=[1]),
+        _node("AveragePool", ["energy"], "around", kernel_shape=around, pads=[1] * 4),
+        _node("Add", ["around", "flat"], "floored"),
+        _node("Sqrt", ["floored"], "contrast"),
+        _node("Div", ["cells", "contrast"], "features"),
+        _node("GlobalAveragePool", ["features"], "everywhere"),
+        _node("Sub", ["features", "everywhere"], "difference"),
+        _node("Mul", ["difference", "window"], "seen"),
+        _node("Flatten", ["seen"], "flattened"),
+        _node("Cast", ["signs"], "directions", to=[_FLOAT]),
+        _node("MatMul", ["flattened", "directions"], "embedding"),
+    ]
+    constants: dict[str, NDArray[np.generic]] = {
+        "edges": _edge_filters(),
+        "flat": np.asarray([_FLAT], np.float32),
         "window": _window(),
         "signs": _signs(_DIRECTIONS * _CELLS * _CELLS, DEMO_DIMENSION),
     }
-    return _model([*_features(), *_projection()], constants, "embedding", ["N", DEMO_DIMENSION])
+    return _model(nodes, constants)
 
 
 @cache
@@ -81,92 +96,25 @@ def is_demo_model(sha256: str) -> bool:
     return sha256.lower() == demo_model_sha256()
 
 
-def require_face(crop: NDArray[np.uint8]) -> None:
-    """Refuse what is no aligned face, by how alike its edges are to the average drawn face's.
-
-    Which side of an edge is the darker one differs between people, so opposite directions count
-    together; and what every picture has of a direction is taken off.
-    """
-    edges, average = _undirected(_features_of(crop)), _undirected(_average_features())
-    weight = np.square(_window(), dtype=np.float64)
-    both, own, other = (
-        float((weight * product).sum())
-        for product in (edges * average, np.square(edges), np.square(average))
-    )
-    if both < _LEAST_ALIKE * np.sqrt(own * other) or own == 0:
+def require_face(embedding: NDArray[np.float32], drawn: NDArray[np.float32]) -> None:
+    """Refuse the embedding of what is no aligned face, by the mean embedding of drawn faces."""
+    if embedding @ drawn < _LEAST_ALIKE * np.linalg.norm(drawn):
         raise NoFace(
             "no cartoon face was found, and the demo model sees no others: send one that the demo "
             "drew, upright and aligned"
         )
 
 
-def _undirected(features: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Edges by undirected direction and cell, (4, 27, 27), less their mean over the window."""
-    half = _DIRECTIONS // 2
-    edges = features[:half].astype(np.float64) + features[half:]
-    weight = np.square(_window(), dtype=np.float64)
-    return np.asarray(edges - (edges * weight).sum(axis=(1, 2), keepdims=True) / weight.sum())
-
-
-def _features() -> list[bytes]:
-    """Edges by direction and cell, relative to the contrast around: (N, 8, 27, 27)."""
-    cell, step, around = [_CELL] * 2, [_STRIDE] * 2, [3, 3]
-    return [
-        _node("Conv", ["image", "edges"], "slopes", pads=[_REACH] * 4),
-        _node("Relu", ["slopes"], "rising"),
-        _node("AveragePool", ["rising"], "cells", kernel_shape=cell, strides=step),
-        _node("ReduceSumSquare", ["cells"], "energy", axes=[1]),
-        _node("AveragePool", ["energy"], "around", kernel_shape=around, pads=[1] * 4),
-        _node("Add", ["around", "flat"], "floored"),
-        _node("Sqrt", ["floored"], "contrast"),
-        _node("Div", ["cells", "contrast"], "features"),
-    ]
-
-
-def _projection() -> list[bytes]:
-    """Take off the average face, weigh the rest by the window and project it."""
-    return [
-        _node("Add", ["features", "average"], "difference"),
-        _node("Mul", ["difference", "window"], "seen"),
-        _node("Flatten", ["seen"], "flattened"),
-        _node("Cast", ["signs"], "directions", to=[_FLOAT]),
-        _node("MatMul", ["flattened", "directions"], "embedding"),
-    ]
-
-
-def _feature_constants() -> dict[str, NDArray[np.generic]]:
+def _edge_filters() -> NDArray[np.float32]:
+    """Slopes of the luminance by direction: (4, 3, 9, 9)."""
     reach = np.arange(-_REACH, _REACH + 1, dtype=np.float64)
     y, x = np.meshgrid(reach, reach, indexing="ij")
     bell = np.exp(-(x**2 + y**2) / (2 * _SIGMA**2))
-    angles = 2 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
+    angles = np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
     slopes = (np.cos(angles)[:, None, None] * x + np.sin(angles)[:, None, None] * y) * bell
     slopes /= np.abs(slopes).sum(axis=(1, 2), keepdims=True)
     luminance = np.array([0.299, 0.587, 0.114])
-    edges = slopes[:, None] * luminance[None, :, None, None]
-    return {"edges": _rounded(edges), "flat": np.asarray([_FLAT], np.float32)}
-
-
-@cache
-def _feature_session() -> ort.InferenceSession:
-    shape: list[str | int] = ["N", _DIRECTIONS, _CELLS, _CELLS]
-    model = _model(_features(), _feature_constants(), "features", shape)
-    options = ort.SessionOptions()
-    options.intra_op_num_threads = 1  # the order of a sum must not depend on the number of cores
-    return ort.InferenceSession(model, options, providers=["CPUExecutionProvider"])
-
-
-@cache
-def _average_features() -> NDArray[np.float64]:
-    """Mean features of drawn people: (8, 27, 27), rounded so that its last bits are stable."""
-    faces = draw_people(_AVERAGED, range(1), size=_SIDE)
-    mean = np.mean([_features_of(face) for face in faces], axis=0, dtype=np.float64)
-    return np.asarray(np.round(mean * 64) / 64)
-
-
-def _features_of(crop: NDArray[np.uint8]) -> NDArray[np.float32]:
-    image = ((crop.astype(np.float32) - 127.5) / 127.5).transpose(2, 0, 1)[None]
-    features = _feature_session().run(None, {"image": np.ascontiguousarray(image)})[0][0]
-    return np.asarray(features, np.float32)
+    return _rounded(slopes[:, None] * luminance[None, :, None, None])
 
 
 def _window() -> NDArray[np.float32]:
@@ -229,21 +177,21 @@ def _constant(name: str, values: NDArray[np.generic]) -> bytes:
     return _message(*((1, size) for size in values.shape), (2, kind), (8, name), (9, data))
 
 
-def _value(name: str, shape: list[str | int]) -> bytes:
-    """ValueInfoProto: a name and a tensor's type, whose sizes are numbers (1) or names (2)."""
-    sizes = [(1, _message((2 if isinstance(size, str) else 1, size))) for size in shape]
+def _value(name: str, *shape: int) -> bytes:
+    """ValueInfoProto of float32: a name and a tensor's type, sizes by number (1) or name (2)."""
+    sizes = [(1, _message((2, "N"))), *((1, _message((1, size))) for size in shape)]
     tensor = _message((1, _FLOAT), (2, _message(*sizes)))
     return _message((1, name), (2, _message((1, tensor))))
 
 
-def _model(nodes: list[bytes], constants: Constants, output: str, shape: list[str | int]) -> bytes:
+def _model(nodes: list[bytes], constants: Mapping[str, NDArray[np.generic]]) -> bytes:
     """ModelProto: ir_version 1, producer 2, doc_string 6, graph 7, opset 8, metadata 14."""
     graph = _message(
         *((1, node) for node in nodes),
         (2, "veilface-demo"),
         *((5, _constant(name, values)) for name, values in constants.items()),
-        (11, _value("image", ["N", 3, _SIDE, _SIDE])),
-        (12, _value(output, shape)),
+        (11, _value("image", 3, _SIDE, _SIDE)),
+        (12, _value("embedding", DEMO_DIMENSION)),
     )
     opset, notice = _message((1, ""), (2, 17)), _message((1, "notice"), (2, DEMO_NOTICE))
     head = _message((1, 8), (2, "veilface"), (6, DEMO_NOTICE))
