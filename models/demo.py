@@ -3,15 +3,15 @@
 It lets ``veilface demo`` and the tests run the whole service on a clone that has no weights. It
 looks at the direction of edges around each place of the picture (a histogram of oriented
 gradients, made independent of the light by the contrast around the place), takes off what the
-picture has of a direction everywhere, and projects the rest with fixed random signs to 256 numbers.
-No weight is learnt, and nothing has seen a real face.
+picture has of a direction everywhere, projects the rest with fixed random signs to 256 numbers, and
+takes off the mean of drawn faces. No weight is learnt, and nothing has seen a real face.
 
 **Demo model: not for authentication.** On photos of real people it is little more than a
 comparison of pictures.
 
-It has no detector, because drawn faces come aligned. In its place :func:`require_face` holds an
-embedding against the mean of drawn faces, so that a picture of something else is refused as one
-without a face.
+It has no detector, because drawn faces come aligned. In its place :func:`require_face` holds a
+picture against the mean of drawn faces, so that one of something else is refused as one without a
+face.
 """
 
 import hashlib
@@ -20,16 +20,15 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+import onnxruntime as ort
 from numpy.typing import NDArray
 
 from models.errors import NoFace
+from models.synthetic import draw_people
 
 DEMO_NOTICE = "demo model: not for authentication"
 DEMO_DIMENSION = 256
 DEMO_FILE = "demo.onnx"
-AVERAGED = range(10_000_000, 10_000_064)
-"""People whom no demo and no test enrolls: the mean of their embeddings is a drawn face's."""
-
 _SIDE = 112
 _DIRECTIONS = 4
 _SIGMA = 1.2  # width of the edge filters in pixels
@@ -40,6 +39,7 @@ _CELLS = (_SIDE - _CELL) // _STRIDE + 1
 _FLAT = 9e-4  # squared contrast below which a cell is sensor noise: (0.03)^2 on a scale of -1 to 1
 _CENTRE = (56.0, 62.0)  # of the window that keeps background and most hair out
 _WINDOW = (30.0, 42.0)
+_AVERAGED = range(10_000_000, 10_000_064)  # people whom no demo and no test enrolls
 _LEAST_ALIKE = 0.31  # cosine to the mean; tests/models/test_demo.py measures both sides
 _GRID = 1 / 4096  # constants are rounded to it, so that no bit depends on a machine's libm
 
@@ -58,6 +58,10 @@ def build_demo_pack(folder: Path) -> Path:
 @cache
 def demo_model_bytes() -> bytes:
     """Build the ONNX file: the same bytes each time, since its SHA-256 stands in contracts."""
+    return _model_less(_mean_projection())
+
+
+def _model_less(mean: NDArray[np.float32]) -> bytes:
     cell, step, around = [_CELL] * 2, [_STRIDE] * 2, [3, 3]
     nodes = [
         _node("Conv", ["image", "edges"], "slopes", pads=[_REACH] * 4),
@@ -74,13 +78,15 @@ def demo_model_bytes() -> bytes:
         _node("Mul", ["difference", "window"], "seen"),
         _node("Flatten", ["seen"], "flattened"),
         _node("Cast", ["signs"], "directions", to=[_FLOAT]),
-        _node("MatMul", ["flattened", "directions"], "embedding"),
+        _node("MatMul", ["flattened", "directions"], "projected"),
+        _node("Sub", ["projected", "mean"], "embedding"),
     ]
     constants: dict[str, NDArray[np.generic]] = {
         "edges": _edge_filters(),
         "flat": np.asarray([_FLAT], np.float32),
         "window": _window(),
         "signs": _signs(_DIRECTIONS * _CELLS * _CELLS, DEMO_DIMENSION),
+        "mean": mean,
     }
     return _model(nodes, constants)
 
@@ -96,13 +102,36 @@ def is_demo_model(sha256: str) -> bool:
     return sha256.lower() == demo_model_sha256()
 
 
-def require_face(embedding: NDArray[np.float32], drawn: NDArray[np.float32]) -> None:
-    """Refuse the embedding of what is no aligned face, by the mean embedding of drawn faces."""
-    if embedding @ drawn < _LEAST_ALIKE * np.linalg.norm(drawn):
+def require_face(crop: NDArray[np.uint8]) -> None:
+    """Refuse what is no aligned face, by how alike its projection is to that of drawn faces."""
+    projected, mean = _projections(crop[None])[0], _mean_projection()
+    if projected @ mean < _LEAST_ALIKE * np.linalg.norm(projected) * np.linalg.norm(mean):
         raise NoFace(
             "no cartoon face was found, and the demo model sees no others: send one that the demo "
             "drew, upright and aligned"
         )
+
+
+@cache
+def _mean_projection() -> NDArray[np.float32]:
+    """Mean projection of drawn people, (256,), rounded so that its bits are stable."""
+    mean = _projections(draw_people(_AVERAGED, range(1), size=_SIDE)).mean(axis=0)
+    return np.asarray(np.round(mean * 16) / 16, np.float32)
+
+
+def _projections(crops: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """What the model gives of faces, (B, 256), before it takes off their mean."""
+    images = ((crops.astype(np.float32) - 127.5) / 127.5).transpose(0, 3, 1, 2)
+    rows = _session().run(None, {"image": np.ascontiguousarray(images)})[0]
+    return np.asarray(rows, np.float64)
+
+
+@cache
+def _session() -> ort.InferenceSession:
+    options = ort.SessionOptions()
+    options.intra_op_num_threads = 1  # the order of a sum must not depend on the number of cores
+    model = _model_less(np.zeros(DEMO_DIMENSION, np.float32))
+    return ort.InferenceSession(model, options, providers=["CPUExecutionProvider"])
 
 
 def _edge_filters() -> NDArray[np.float32]:

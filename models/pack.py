@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any, TypedDict, Unpack
 
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 from models.alignment import TEMPLATE_NAME, align, template
 from models.boxes import Face, ranked
 from models.decoding import decode_image, picture_digest
-from models.demo import AVERAGED, DEMO_DIMENSION, is_demo_model, require_face
+from models.demo import DEMO_DIMENSION, is_demo_model, require_face
 from models.detection import DEFAULT_SIZE, Detector, find_faces, require_upright
 from models.detectors import Scrfd, YuNet
 from models.embedding import Embedder, Preprocessing, normalises_inside
@@ -24,7 +23,6 @@ from models.pack_file import PackFile, read_pack_file
 from models.pack_graphs import PackGraph, Role, image_size, pick, read_graphs
 from models.quality import DEFAULT_QUALITY, Quality, QualityLimits, check, measure
 from models.selection import FacePolicy, select_face
-from models.synthetic import draw_people
 
 
 @dataclass(frozen=True)
@@ -218,13 +216,7 @@ class ModelPack:
         recommended = 0.0 if self._detector is None else self._detector.recommended_score
         check(taken.quality, limits, recommended_score=recommended)
         if self._demo:
-            require_face(self.embed(taken.crop[None])[0], self._drawn_face)
-
-    @cached_property
-    def _drawn_face(self) -> NDArray[np.float32]:
-        """Mean embedding of the demo's people."""
-        faces = draw_people(AVERAGED, range(1), size=self.crop_size)
-        return np.asarray(self.embed(faces).mean(axis=0))
+            require_face(taken.crop)
 
     def is_clear(self, quality: Quality) -> bool:
         """Whether the detector was as sure of a face as it is of one that nothing covers."""

@@ -86,3 +86,4 @@ def test_embeddings_separate_drawn_people(session, faces):
     for target, worst in ((1e-2, 0.02), (1e-3, 0.05)):
         threshold = np.quantile(impostor, 1 - target)
         assert (genuine < threshold).mean() <= worst
+    assert abs(impostor.mean()) < 0.1
