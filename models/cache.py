@@ -69,7 +69,7 @@ class EmbeddingCache:
     def put(self, key: bytes, embedding: NDArray[np.float32]) -> None:
         """Keep an embedding; on disk only after `flush`."""
         with self._lock:
-            self._entries[key] = np.array(embedding, dtype=np.float32)
+            self._entries[key] = np.asarray(embedding, dtype=np.float32)
             self._changed = True
 
     def flush(self) -> None:

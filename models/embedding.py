@@ -63,28 +63,18 @@ class Embedder:
 
     def embed(self, crops: NDArray[np.uint8], *, flip: bool) -> Rows:
         """Embed aligned crops."""
-        raw = self._raw(self._checked(crops))
+        raw = self._raw(crops)
         return self._normalised(raw + self._raw(crops[:, :, ::-1]) if flip else raw)
 
-    def _checked(self, crops: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def _raw(self, crops: NDArray[np.uint8]) -> Rows:
         size = self.preprocessing.size
         if crops.dtype != np.uint8 or crops.ndim != 4 or crops.shape[1:] != (size, size, 3):
             raise ModelError(
                 f"Aligned crops must be uint8 of shape (B, {size}, {size}, 3); got {crops.dtype}"
                 f" of shape {crops.shape}."
             )
-        return crops
-
-    def _raw(self, crops: NDArray[np.uint8]) -> Rows:
-        rows = [
-            run_embedder(
-                self._session,
-                (part[..., self._order].astype(np.float32) - self._mean) * self._inverse_scale,
-            )
-            for part in np.split(crops, range(MAX_BATCH, len(crops), MAX_BATCH))
-            if len(part)
-        ]
-        return np.concatenate(rows) if rows else np.empty((0, self.n), np.float32)
+        values = crops[..., self._order].astype(np.float32)
+        return run_embedder(self._session, (values - self._mean) * self._inverse_scale)
 
     def _normalised(self, raw: Rows) -> Rows:
         # float64: squares of large activations overflow float32.
@@ -100,17 +90,18 @@ class Embedder:
 def run_embedder(session: Session, values: NDArray[np.float32]) -> Rows:
     """Run an embedding graph on pictures of one size, (B, s, s, 3), in its channel order."""
     image = session.inputs[0]
-    blob = np.ascontiguousarray(values.transpose(0, 3, 1, 2))
-    step = image.shape[0] or len(blob)
+    step = image.shape[0] or MAX_BATCH
     rows = []
-    for start in range(0, len(blob), step):
-        part = blob[start : start + step]
+    for start in range(0, len(values), step):
+        part = values[start : start + step].transpose(0, 3, 1, 2)
         # A graph with a fixed batch gets its last one filled up with zeros.
-        missing = step - len(part)
-        fed = np.pad(part, ((0, missing), (0, 0), (0, 0), (0, 0))) if missing else part
-        row = session.run({image.name: fed})[0]
-        if row.ndim != 2 or len(row) != step:
-            raise ModelError(f"{session.name}: {step} crops gave an output of shape {row.shape}.")
+        missing = step - len(part) if image.shape[0] else 0
+        blob = np.pad(part, ((0, missing), (0, 0), (0, 0), (0, 0)))
+        row = session.run({image.name: np.ascontiguousarray(blob)})[0]
+        if row.ndim != 2 or len(row) != len(blob):
+            raise ModelError(
+                f"{session.name}: {len(blob)} crops gave an output of shape {row.shape}."
+            )
         rows.append(row[: len(part)])
     return np.concatenate(rows)
 

@@ -20,8 +20,8 @@ from models.sessions import default_workers
 
 CHUNK = 128
 """Photos embedded together. Their crops are in memory at once, photos only one per thread."""
-_KEPT_SECONDS = 15.0
-"""Between two writes of the cache, at least: what a killed run loses."""
+_KEPT_SECONDS = 60.0
+"""Between two writes of the cache: what a killed run loses."""
 
 Advance = Callable[[int], None]
 
@@ -69,6 +69,18 @@ class Extraction:
         return dict(Counter(failure.code for failure in self.failures).most_common())
 
 
+@dataclass(eq=False)
+class _File:
+    """One file on its way: its crop, then its embedding; or why there is none."""
+
+    path: Path
+    key: bytes = field(default=b"", repr=False)
+    crop: NDArray[np.uint8] | None = field(default=None, repr=False)
+    embedding: NDArray[np.float32] | None = field(default=None, repr=False)
+    is_cached: bool = False
+    failure: Failure | None = None
+
+
 class Extractor:
     """Embeds files with one pack.
 
@@ -78,7 +90,9 @@ class Extractor:
     Parameters
     ----------
     cache
-        Where known embeddings are kept; ``None`` computes all anew.
+        Where known embeddings are kept; ``None`` keeps none beyond this extractor.
+    aligned
+        Photos are aligned crops: no face is looked for.
     """
 
     def __init__(
@@ -89,45 +103,37 @@ class Extractor:
         aligned: bool = False,
     ) -> None:
         self._pack = pack
-        self._cache = cache
+        self._cache = EmbeddingCache() if cache is None else cache
         self._aligned = aligned or pack.info.detector is None
-        self._kind = self._settings_digest()
+        self._digest = self._settings_digest()
 
     def extract(
         self, photos: Iterable[Path | Photo], *, progress: Advance | None = None
     ) -> Extraction:
         """Embed photos."""
-        files = [one if isinstance(one, Photo) else Photo(str(one), one) for one in photos]
-        prepared: list[_Prepared] = []
-        keep_after = time.monotonic() + _KEPT_SECONDS
+        given = [one if isinstance(one, Photo) else Photo(str(one), one) for one in photos]
+        files: list[_File] = []
+        kept_at = time.monotonic()
         try:
             with ThreadPoolExecutor(default_workers()) as pool:
-                for start in range(0, len(files), CHUNK):
-                    chunk = list(pool.map(self._prepare, files[start : start + CHUNK]))
-                    prepared += self._embedded(chunk)
+                for start in range(0, len(given), CHUNK):
+                    chunk = list(pool.map(self._prepared, given[start : start + CHUNK]))
+                    self._embed(chunk)
+                    files += chunk
                     if progress is not None:
                         progress(len(chunk))
-                    keep_after = self._keep(keep_after)
+                    if time.monotonic() > kept_at + _KEPT_SECONDS:
+                        self._cache.flush()
+                        kept_at = time.monotonic()
         finally:
-            if self._cache is not None:
-                self._cache.flush()
-        done = [(Path(file.name), item) for file, item in zip(files, prepared, strict=True)]
-        rows = [item.embedding for _, item in done if item.embedding is not None]
+            self._cache.flush()
+        rows = [file.embedding for file in files if file.embedding is not None]
         return Extraction(
-            np.stack(rows) if rows else np.empty((0, self._pack.info.n), np.float32),
-            [path for path, item in done if item.failure is None],
-            [item.failure for item in prepared if item.failure is not None],
-            sum(item.is_cached for item in prepared),
+            embeddings=np.stack(rows) if rows else np.empty((0, self._pack.info.n), np.float32),
+            paths=[file.path for file in files if file.failure is None],
+            failures=[file.failure for file in files if file.failure is not None],
+            cached=sum(file.is_cached for file in files),
         )
-
-    def _keep(self, after: float) -> float:
-        """Write the cache if it is time to; when to do so next, however large the file grows."""
-        began = time.monotonic()
-        if self._cache is None or began < after:
-            return after
-        self._cache.flush()
-        ended = time.monotonic()
-        return ended + max(_KEPT_SECONDS, 20 * (ended - began))
 
     def _settings_digest(self) -> bytes:
         """Everything besides the picture that an embedding depends on."""
@@ -137,54 +143,41 @@ class Extractor:
             detector = [info.detector.sha256, list(info.detector.input_size)]
         settings = {
             "embedder": info.embedder_sha256,
-            "preprocessing": dict(info.preprocessing),
+            "preprocessing": info.preprocessing,
             "detector": detector,
             "turned": "refused",
         }
         return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).digest()
 
-    def _prepare(self, photo: Photo) -> "_Prepared":
+    def _prepared(self, photo: Photo) -> _File:
         """Read, look up, decode, find the face; whatever is wrong with the file is an answer."""
-        path = Path(photo.name)
+        file = _File(Path(photo.name))
         try:
             data = photo.read()
-            key = hashlib.sha256(self._kind + hashlib.sha256(data).digest()).digest()
-            embedding = None if self._cache is None else self._cache.get(key)
-            if embedding is not None:
-                return _Prepared(key, embedding=embedding, is_cached=True)
+            file.key = hashlib.sha256(self._digest + hashlib.sha256(data).digest()).digest()
+            file.embedding = self._cache.get(file.key)
+            file.is_cached = file.embedding is not None
+            if file.is_cached:
+                return file
             if self._aligned:
-                crop = self._pack.as_aligned(decode_image(data))
+                file.crop = self._pack.as_aligned(decode_image(data))
             else:
-                crop = self._pack.crop_photo(data, policy=None, quality=None).crop
-            return _Prepared(key, crop=crop)
+                file.crop = self._pack.crop_photo(data, policy=None, quality=None).crop
         except (ImageError, FaceError) as error:
-            return _Prepared(b"", failure=Failure(path, error.code, str(error)))
+            file.failure = Failure(file.path, error.code, str(error))
         except OSError as error:
             reason = f"The file cannot be read: {error.strerror}."
-            return _Prepared(b"", failure=Failure(path, "unreadable_file", reason))
+            file.failure = Failure(file.path, "unreadable_file", reason)
+        return file
 
-    def _embedded(self, chunk: Sequence["_Prepared"]) -> list["_Prepared"]:
+    def _embed(self, chunk: Sequence[_File]) -> None:
         """Embed the crops of a chunk in batches; copies of one file are computed once."""
-        unique = {item.key: item.crop for item in chunk if item.crop is not None}
-        if not unique:
-            return list(chunk)
-        crops = np.stack(list(unique.values()))
-        made = dict(zip(unique, self._pack.embed(crops), strict=True))
-        if self._cache is not None:
-            for key, embedding in made.items():
-                self._cache.put(key, embedding)
-        return [
-            item if item.crop is None else _Prepared(item.key, embedding=made[item.key])
-            for item in chunk
-        ]
-
-
-@dataclass(frozen=True, eq=False)
-class _Prepared:
-    """One file: its crop, which is to be embedded, its embedding, or why there is none."""
-
-    key: bytes = field(repr=False)
-    crop: NDArray[np.uint8] | None = field(default=None, repr=False)
-    embedding: NDArray[np.float32] | None = field(default=None, repr=False)
-    is_cached: bool = False
-    failure: Failure | None = None
+        crops = {file.key: file.crop for file in chunk if file.crop is not None}
+        if not crops:
+            return
+        made = dict(zip(crops, self._pack.embed(np.stack(list(crops.values()))), strict=True))
+        for key, embedding in made.items():
+            self._cache.put(key, embedding)
+        for file in chunk:
+            if file.crop is not None:
+                file.embedding, file.crop = made[file.key], None

@@ -1,7 +1,7 @@
 """Is this face good enough to enroll or to verify? Measures, limits, and named refusals."""
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -45,10 +45,6 @@ class Quality:
     # side; negative where a point lies outside.
     border: float | None
     aspect: float | None  # height of the box over its width
-
-    def as_dict(self) -> dict[str, float | None]:
-        """JSON-able form."""
-        return asdict(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,8 +96,7 @@ def measure(crop: NDArray[np.uint8], face: Face | None, image: NDArray[np.uint8]
 def _exposure(image: NDArray[np.uint8]) -> float:
     step = max(1, max(image.shape[:2]) // _EXPOSURE_SIDE)
     grey = cv2.cvtColor(np.ascontiguousarray(image[::step, ::step]), cv2.COLOR_RGB2GRAY)
-    counts = np.cumsum(np.bincount(grey.ravel(), minlength=256))
-    return float(np.searchsorted(counts, int(0.95 * (grey.size - 1)), side="right"))
+    return float(np.percentile(grey, 95, method="lower"))
 
 
 def _border(keypoints: NDArray[np.floating], image_shape: tuple[int, ...]) -> float:

@@ -1,3 +1,5 @@
+from dataclasses import asdict
+
 import cv2
 import numpy as np
 import pytest
@@ -76,7 +78,7 @@ def test_sharpness_falls_with_blur_and_ignores_exposure_and_contrast():
 )
 def test_each_failure_is_named_with_value_and_limit(change, name):
     with pytest.raises(LowQuality, match=name) as caught:
-        check(Quality(**(GOOD.as_dict() | change)), recommended_score=0.6)
+        check(Quality(**(asdict(GOOD) | change)), recommended_score=0.6)
     assert list(caught.value.details) == [name]
     detail = caught.value.details[name]
     ((measured, value),) = change.items()
@@ -88,7 +90,7 @@ def test_each_failure_is_named_with_value_and_limit(change, name):
 
 
 def test_all_failures_are_named_at_once():
-    bad = Quality(**(GOOD.as_dict() | {"sharpness": 0.0, "brightness": 1.0, "yaw": 80.0}))
+    bad = Quality(**(asdict(GOOD) | {"sharpness": 0.0, "brightness": 1.0, "yaw": 80.0}))
     with pytest.raises(LowQuality) as caught:
         check(bad)
     assert list(caught.value.details) == ["blur", "darkness", "pose"]
@@ -96,7 +98,7 @@ def test_all_failures_are_named_at_once():
 
 def test_a_small_face_is_told_apart():
     with pytest.raises(FaceTooSmall) as caught:
-        check(Quality(**(GOOD.as_dict() | {"face_size": 12.0, "sharpness": 0.0})))
+        check(Quality(**(asdict(GOOD) | {"face_size": 12.0, "sharpness": 0.0})))
     assert caught.value.code == "face_too_small"
     assert caught.value.details == {"size": {"value": 12.0, "limit": 24.0}}
 

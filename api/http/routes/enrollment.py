@@ -1,5 +1,7 @@
 """Enrollment: photos, or a client's template."""
 
+from dataclasses import asdict
+
 from fastapi import APIRouter, Response
 
 from api.http.auth import Enrolls
@@ -97,7 +99,7 @@ async def enroll(
                 replaced=not stored.created,
                 holder_key=enrollment.holder_salt is not None,
                 images=[
-                    Photo(index=index, status="used", quality=quality.as_dict())
+                    Photo(index=index, status="used", quality=asdict(quality))
                     for index, quality in enumerate(enrollment.qualities)
                 ],
             )

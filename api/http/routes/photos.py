@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from typing import Any
 
 from fastapi import APIRouter
@@ -53,7 +54,7 @@ async def check_photo(call: EnrollsOrVerifies) -> PhotoCheckAnswer:
                 usable=True,
                 message="one face, large and clear enough",
                 box=None if taken.box is None else [round(side, 1) for side in taken.box],
-                quality=taken.quality.as_dict(),
+                quality=asdict(taken.quality),
             )
 
         return await call.compute(work)

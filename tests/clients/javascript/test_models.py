@@ -2,6 +2,7 @@
 
 import base64
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -84,7 +85,7 @@ def compare(pack: ModelPack, image: Image, ours: dict[str, Any]) -> None:
         assert gap.max() < 0.5
     crop = ours["crop"].reshape(theirs.crop.shape)
     assert np.abs(crop.astype(int) - theirs.crop).mean() < 1
-    quality = theirs.quality.as_dict()
+    quality = asdict(theirs.quality)
     assert set(ours["quality"]) == set(quality)
     for name, value in quality.items():
         expected = None if value is None else pytest.approx(value, rel=0.02, abs=0.2)
