@@ -64,8 +64,6 @@ class FaceError(ModelError):
 class NoFace(FaceError):
     """No face was found."""
 
-    code = "no_face"
-
 
 class MultipleFaces(FaceError):
     """More than one face that could be meant was found."""
@@ -80,12 +78,7 @@ class FaceTooSmall(FaceError):
 
 
 class LowQuality(FaceError):
-    """The face was found and failed at least one quality limit.
-
-    ``details`` maps each failed measure (``score``, ``blur``, ``darkness``, ``brightness``,
-    ``turned``) to ``{"value": measured, "limit": limit}``, and ``pose`` (``yaw``, ``pitch``) and
-    ``hidden`` (``border``, ``aspect``) to one such pair for each that failed.
-    """
+    """The face fails a limit; ``details`` are those of `models.quality.check`."""
 
     code = "low_quality"
 

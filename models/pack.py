@@ -15,7 +15,7 @@ from models.decoding import decode_image, picture_digest
 from models.demo import DEMO_DIMENSION, is_demo_model, require_face
 from models.detection import DEFAULT_SIZE, Detector, find_faces, require_upright
 from models.detectors import Scrfd, YuNet
-from models.embedding import Embedder, Preprocessing, normalises_inside
+from models.embedding import Embedder, Preprocessing, Rows, normalises_inside
 from models.errors import ImageError, ModelError, PackError, PhotoRejected
 from models.faces import FaceCrop, FaceSample
 from models.liveness import PassiveLiveness, open_liveness
@@ -168,7 +168,7 @@ class ModelPack:
         """Crop of a face on the five-point template, uint8, shape (s, s, 3)."""
         return align(image, face.keypoints, size=self.crop_size)
 
-    def embed(self, aligned: NDArray[np.uint8]) -> NDArray[np.float32]:
+    def embed(self, aligned: NDArray[np.uint8]) -> Rows:
         """Embed aligned crops, RGB uint8 (B, s, s, 3), to unit rows, float32 (B, n)."""
         return self._embedder.embed(aligned, flip=self._embedder.preprocessing.flip)
 
@@ -183,8 +183,7 @@ class ModelPack:
     ) -> FaceCrop:
         """Decode, find the face, align and check it: `embed_photo` without the embedding.
 
-        Parameters and errors as there. The whole picture is dropped: with `liveness` the face is
-        scored on it before, and with `digested` its digest is taken.
+        The whole picture is dropped; what `liveness` and `digested` ask for is taken of it before.
         """
         if liveness and self.liveness is None:
             raise PackError(
@@ -280,26 +279,24 @@ class ModelPack:
         return np.asarray(cv2.resize(image, (size, size), interpolation=shrink), dtype=np.uint8)
 
 
-def _embedder(graph: PackGraph, stated: PackFile, flip: bool) -> Embedder:
-    size = image_size(graph.session.inputs)
-    fixed = None if size is None else size[0]
-    if fixed is not None and stated.embedder.input_size not in (None, fixed):
+def _embedder(graph: PackGraph, pack_file: PackFile, flip: bool) -> Embedder:
+    stated = pack_file.embedder
+    fixed, _ = image_size(graph.session.inputs) or (None, None)
+    side = fixed or stated.input_size or 0
+    if stated.input_size not in (None, side):
         raise PackError(
-            f"pack.toml states input_size {stated.embedder.input_size}, and {graph.path} takes"
-            f" {fixed} only; remove the key."
+            f"pack.toml states input_size {stated.input_size}, and {graph.path} takes {fixed}"
+            " only; remove the key."
         )
-    side = int(fixed or stated.embedder.input_size or 0)
     try:
-        is_inside = None in (stated.embedder.mean, stated.embedder.scale) and normalises_inside(
-            graph.session, side
-        )
+        is_inside = None in (stated.mean, stated.scale) and normalises_inside(graph.session, side)
         mean, scale = (0.0, 1.0) if is_inside else (127.5, 127.5)
         preprocessing = Preprocessing(
             alignment=TEMPLATE_NAME,
             size=side,
-            channel_order=stated.embedder.channel_order or "rgb",
-            mean=stated.embedder.mean or (mean,) * 3,
-            scale=stated.embedder.scale or (scale,) * 3,
+            channel_order=stated.channel_order or "rgb",
+            mean=stated.mean or (mean,) * 3,
+            scale=stated.scale or (scale,) * 3,
             flip=flip,
         )
         return Embedder(graph.session, preprocessing)

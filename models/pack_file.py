@@ -43,20 +43,16 @@ def _per_channel(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else (value,) * 3
 
 
-def _without_zero(scale: tuple[float, ...]) -> tuple[float, ...]:
-    if 0 in scale:
-        raise ValueError("it divides the input and must not be 0")
-    return scale
-
-
 def _ascending(values: tuple[float, float]) -> tuple[float, float]:
     if values[0] >= values[1]:
         raise ValueError("the two numbers must ascend, such as [0, 1]")
     return values
 
 
-Triple = tuple[Number, Number, Number]
-PerChannel = Annotated[Triple, BeforeValidator(_per_channel)]
+Positive = Annotated[float, Field(gt=0, lt=1e6)]
+Triple = tuple[float, float, float]
+Mean = Annotated[tuple[Number, Number, Number], BeforeValidator(_per_channel)]
+Scale = Annotated[tuple[Positive, Positive, Positive], BeforeValidator(_per_channel)]
 Range = Annotated[
     tuple[Number, Number],
     BeforeValidator(lambda value: tuple(value) if isinstance(value, list) else value),
@@ -73,8 +69,8 @@ class _Table(BaseModel):
 class EmbedderStatement(_Table):
     """What is stated of the embedder."""
 
-    mean: PerChannel | None = None
-    scale: Annotated[PerChannel, AfterValidator(_without_zero)] | None = None
+    mean: Mean | None = None
+    scale: Scale | None = None
     channel_order: ChannelOrder | None = None
     input_size: Annotated[int, Field(ge=112, le=2048, multiple_of=16)] | None = None
 

@@ -177,7 +177,11 @@ def measure_pose(keypoints: NDArray[np.floating]) -> tuple[float, float, float]:
 def check(
     quality: Quality, limits: QualityLimits = DEFAULT_QUALITY, *, recommended_score: float = 0.0
 ) -> None:
-    """Refuse a face that fails a limit."""
+    """Refuse a face that fails a limit.
+
+    The details map each measure that failed to its value and limit; ``pose`` and ``hidden`` to one
+    such pair for each of their parts that failed.
+    """
     if quality.face_size is not None and quality.face_size < limits.min_face_size:
         raise FaceTooSmall(
             f"The face is {quality.face_size:.0f} pixels wide; at least"

@@ -12,19 +12,7 @@ from numpy.typing import NDArray
 
 from models.errors import ModelError, PackError, ProviderUnavailable
 
-PROVIDERS = {
-    "cpu": "CPUExecutionProvider",
-    "cuda": "CUDAExecutionProvider",
-    "tensorrt": "TensorrtExecutionProvider",
-    "rocm": "ROCMExecutionProvider",
-    "migraphx": "MIGraphXExecutionProvider",
-    "openvino": "OpenVINOExecutionProvider",
-    "directml": "DmlExecutionProvider",
-    "coreml": "CoreMLExecutionProvider",
-    "xnnpack": "XnnpackExecutionProvider",
-}
-_SHORT = {full: short for short, full in PROVIDERS.items()}
-
+_SUFFIX = "ExecutionProvider"
 # onnxruntime writes warnings about declared output shapes to stderr for every detector that runs
 # at another size than it was exported for; errors still reach us as exceptions.
 _LOG_ERRORS_ONLY = 3
@@ -32,25 +20,23 @@ _LOG_ERRORS_ONLY = 3
 _NO_FOLDER = f"{os.devnull}/weights"
 
 
-def available_providers() -> list[str]:
-    """Short names of the execution providers of the installed onnxruntime."""
-    return [_SHORT.get(name, name) for name in ort.get_available_providers()]
+def available_providers() -> dict[str, str]:
+    """Execution providers of the installed onnxruntime: their full names by the short ones."""
+    names = ort.get_available_providers()
+    return {name.removesuffix(_SUFFIX).lower(): name for name in names}
 
 
 def resolve_providers(names: Sequence[str]) -> list[str]:
-    """Full onnxruntime names for the requested providers, in the requested order."""
-    available = ", ".join(available_providers())
-    if not names:
-        raise ProviderUnavailable(f"No execution provider was named; available are: {available}.")
-    resolved = [PROVIDERS.get(name.lower(), name) for name in names]
-    for name, full in zip(names, resolved, strict=True):
-        if full not in ort.get_available_providers():
-            raise ProviderUnavailable(
-                f"The execution provider '{name}' was requested and is not available; available"
-                f" are: {available}. Install the onnxruntime build for that accelerator, or"
-                " request one of these."
-            )
-    return resolved
+    """Full names of the providers that are asked for, by full or short ones, in their order."""
+    available = available_providers()
+    resolved = [available.get(name.removesuffix(_SUFFIX).lower()) for name in names]
+    if not names or None in resolved:
+        raise ProviderUnavailable(
+            f"Of the execution providers {', '.join(names) or '(none)'} not all are available;"
+            f" available are: {', '.join(available)}. Install the onnxruntime build for that"
+            " accelerator, or request one of these."
+        )
+    return [name for name in resolved if name is not None]
 
 
 @dataclass(frozen=True)
@@ -68,9 +54,9 @@ class Tensor:
 class Session:
     """One ONNX graph, loaded once, that any number of threads may run.
 
-    ``model`` is serialised ONNX: what was hashed is what runs. ``providers`` are short (``cpu``) or
-    full onnxruntime names, best first; each must be in use after loading, and nothing falls back
-    silently. ``inputs`` is empty where one is not of float32.
+    ``model`` is serialised ONNX: what was hashed is what runs. Each of the ``providers``, best
+    first, must be in use after loading: nothing falls back silently. ``inputs`` is empty where one
+    is not of float32.
     """
 
     def __init__(
@@ -141,8 +127,7 @@ def _load(model: bytes, name: str, providers: list[str], threads: int | None) ->
     # It keeps the bytes for a fallback to another provider, and no session here falls back.
     vars(session).pop("_model_bytes", None)
     running = session.get_providers()
-    missing = [provider for provider in providers if provider not in running]
-    if missing:
+    if missing := set(providers).difference(running):
         raise ProviderUnavailable(
             f"{name}: the execution provider {', '.join(missing)} was requested and did not start;"
             f" running would be {', '.join(running)}. Check its drivers and libraries, or request"

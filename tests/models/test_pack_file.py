@@ -52,7 +52,7 @@ def test_what_is_stated_and_what_is_not(tmp_path):
         ("[embedder]\nmean = [1, 2, true]", "embedder.mean.2: .*valid number"),
         ("[embedder]\nmean = nan", "embedder.mean.0"),
         ("[embedder]\nscale = inf", "embedder.scale.0"),
-        ("[embedder]\nscale = [1, 0, 1]", "must not be 0"),
+        ("[embedder]\nscale = [1, 0, 1]", "greater than 0"),
         ("[embedder]\nchannel_order = 'rbg'", "'rgb' or 'bgr'"),
         ("[embedder]\ninput_size = 120", "multiple of 16"),
         ("[embedder]\ninput_size = 96", "equal to 112"),
