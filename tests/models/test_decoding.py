@@ -196,20 +196,3 @@ def test_nothing_else_escapes_on_flipped_bytes(sample, data):
     for position, mask in flips:
         broken[position] ^= mask
     assert harmless(bytes(broken))
-
-
-@settings(max_examples=150)
-@given(st.sampled_from(SAMPLES), st.floats(0, 1), st.binary(max_size=64))
-def test_nothing_else_escapes_on_cut_and_patched_bytes(sample, share, patch):
-    cut = int(len(sample) * share)
-    assert harmless(sample[:cut])
-    assert harmless(sample[:cut] + patch + sample[cut + len(patch) :])
-
-
-@settings(max_examples=100)
-@given(
-    st.binary(max_size=300),
-    st.sampled_from([b"", b"\xff\xd8\xff\xe1", b"\x89PNG\r\n\x1a\n", b"RIFF\x40\0\0\0WEBPVP8X"]),
-)
-def test_nothing_else_escapes_on_noise(noise, head):
-    assert harmless(head + noise)

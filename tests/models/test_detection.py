@@ -275,23 +275,6 @@ def test_looks_again_near_and_then_in_a_border(wanted, shape):
     np.testing.assert_allclose(face.keypoints[0], [shape[1] / 2, shape[0] / 2], atol=1)
 
 
-@pytest.mark.parametrize("name", ["w600k_mbf", "yunet_mobilefacenet128"])
-def test_real_detectors_find_the_centre_face_and_follow_a_mirror(name, shared_data, lfw_photos):
-    pack = ModelPack.load(shared_data / "packs" / name, threads=1)
-    for photo in sorted(lfw_photos.glob("*/*_0001.jpg"))[:6]:
-        image = decode_image(photo.read_bytes())
-        face = pack.detect(image)[0]
-        middle = (face.box[:2] + face.box[2:]) / 2
-        assert np.abs(middle - 125).max() < 30  # LFW photos are centred on their face
-        eyes, mouth = face.keypoints[:2], face.keypoints[3:]
-        assert eyes[0, 0] < eyes[1, 0]
-        assert mouth[0, 0] < mouth[1, 0]
-        assert eyes[:, 1].max() < face.keypoints[2, 1] < mouth[:, 1].min()
-        mirrored = pack.detect(np.ascontiguousarray(image[:, ::-1]))[0]
-        back = mirrored.keypoints[[1, 0, 2, 4, 3]] * [-1, 1] + [249, 0]
-        assert np.abs(back - face.keypoints).max() < 16
-
-
 def jpeg(pixels: np.ndarray) -> bytes:
     file = io.BytesIO()
     Image.fromarray(pixels).save(file, "JPEG", quality=95)

@@ -6,15 +6,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from models.decoding import decode_image
 from models.errors import (
     ImageError,
-    MultipleFaces,
     PackError,
 )
 from models.pack import ModelPack
 from models.pack_graphs import Role, read_graphs
-from models.selection import FacePolicy
 from tests.models import graphs
 from tests.models.graphs import pooled, pooling_embedder, unit, write_pack
 
@@ -189,36 +186,3 @@ def test_real_packs_are_recognised(real):
     n, kind, mean = expected[real.info.name]
     assert (real.info.n, real.info.detector.kind) == (n, kind)
     assert real.info.preprocessing["mean"] == [mean] * 3
-
-
-def people(lfw_photos, count: int) -> list[list[bytes]]:
-    folders = sorted(p for p in lfw_photos.iterdir() if p.is_dir())
-    step = max(1, len(folders) // count)
-    return [
-        [path.read_bytes() for path in sorted(folder.glob("*.jpg"))[:2]]
-        for folder in folders[::step][:count]
-    ]
-
-
-@pytest.mark.parametrize("middle", [True, False])
-@pytest.mark.parametrize("shrink", [1, 2, 3])
-def test_of_two_people_the_one_who_is_large_and_in_the_middle_is_taken(
-    real, lfw_photos, middle, shrink
-):
-    """Beside the first person stands another one, ``shrink`` times as far away."""
-    first, second = (decode_image(photos[0]) for photos in people(lfw_photos, 2))
-    picture = np.zeros((250, 750, 3), np.uint8)
-    left = 250 if middle else 0
-    picture[:, left : left + 250] = first
-    small = second[::shrink, ::shrink]
-    picture[: len(small), 750 - len(small) :] = small
-    alone = real.embed_photo(people(lfw_photos, 2)[0][0], policy=None, quality=None)
-    for policy in FacePolicy:
-        taken = (
-            (policy is FacePolicy.DOMINANT and middle) or policy is FacePolicy.LARGEST
-        ) and shrink > 1
-        if taken:
-            assert real.embed_photo(png(picture), policy=policy).embedding @ alone.embedding > 0.8
-        else:
-            with pytest.raises(MultipleFaces, match="2 faces"):
-                real.embed_photo(png(picture), policy=policy)
