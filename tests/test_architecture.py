@@ -116,18 +116,3 @@ def test_the_layers_are_those_of_the_page() -> None:
     rows = re.findall(r"^\| (\d) \| (.+?) \|", text, flags=re.MULTILINE)
     stated = {name: int(layer) for layer, names in rows for name in re.findall(r"`(\w+)/`", names)}
     assert stated == LAYERS
-
-
-@pytest.mark.parametrize(
-    ("package", "line", "imports"),
-    [
-        ("templates", "import models", {"models"}),
-        ("verify", "def f():\n    import api.settings", {"api"}),
-        ("verify", "import importlib\nimportlib.import_module('api.http.app')", {"api"}),
-        ("attacks", "import enroll, api", {"api"}),
-        ("api", "import attacks, enroll, verify, models, templates", set()),
-        ("models", "import numpy.api", set()),
-    ],
-)
-def test_the_check_sees_an_import(package: str, line: str, imports: set[str]) -> None:
-    assert forbidden(package, imported_packages(line)) == imports

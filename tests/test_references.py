@@ -12,8 +12,6 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).resolve().parent.parent
 PAPER = {"1", "2", "3", "3.1", "3.2", "4", "4.1", "4.2", "4.3", "5", "6"}
 PAGE = r"(?:docs/)?(?P<page>[\w-]+)\.md"
@@ -84,22 +82,3 @@ def test_every_reference_resolves() -> None:
         if (missing := [*unresolved(path.read_text(encoding="utf-8"), path, ROOT / "docs")])
     }
     assert wrong == {}
-
-
-@pytest.mark.parametrize(
-    ("text", "missing"),
-    [
-        ("docs/page.md §1", 0),
-        ("docs/page.md §3", 1),
-        ("docs/page.md §1 to §1.3", 1),
-        ("docs/gone.md §1", 1),
-        ("METHOD §1", 1),
-        ("§1", 1),
-        ('docs/page.md "The first"', 1),
-    ],
-)
-def test_what_is_planted_is_found(text: str, missing: int, tmp_path: Path) -> None:
-    (tmp_path / "page.md").write_text(
-        "# Page\n\n## 1. One\n\n### 1.2 Two\n\n## 2. Two\n\n## The `last`\n"
-    )
-    assert len([*unresolved(text, tmp_path / "source.py", tmp_path)]) == missing

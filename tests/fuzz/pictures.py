@@ -50,19 +50,6 @@ def tiff(rng: random.Random) -> bytes:
     return start + b"".join(entries) + following + rng.randbytes(rng.choice((0, 16, 3000)))
 
 
-def packet(rng: random.Random) -> bytes:
-    """An XMP packet."""
-    return rng.choice(
-        (
-            b'<rdf:Description tiff:Orientation="6"/>',
-            b"<tiff:Orientation>9</tiff:Orientation>",
-            b'tiff:Orientation="' * 5000,
-            b"\xff\xfe" * 40,
-            b'tiff:Orientation="\xd9\xa3"',
-        )
-    )
-
-
 def noise(rng: random.Random) -> bytes:
     return rng.randbytes(rng.choice((0, 1, 2, 6, 13, 26, 300, 3000)))
 
@@ -87,21 +74,14 @@ def png(chunks: list[Part]) -> bytes:
 
 
 def hostile_chunk(rng: random.Random) -> Part:
-    keyword = rng.choice((b"Comment", b"XML:com.adobe.xmp", b"Raw profile type exif", b"a" * 79))
-    size = rng.choice((10, 2**20 - 1, 2**20 + 1, 2**23))
-    bomb = zlib.compress(rng.choice((b"\0", b"a")) * size, 9)
-    raw = b"\nexif\n  40\n" + tiff(rng).hex().encode()
+    bomb = zlib.compress(bytes(rng.choice((10, 2**20 - 1, 2**20 + 1, 2**23))), 9)
     name = rng.choice((b"PLTE", b"tRNS", b"fcTL", b"fdAT", b"IDAT", b"IEND", b"gAMA", b"pHYs",
                        b"sBIT", b"CgBI", rng.randbytes(4)))  # fmt: skip
     return rng.choice(
         (
             (b"iCCP", b"x\0\0" + bomb),
-            (b"zTXt", keyword + b"\0\0" + bomb),
-            (b"zTXt", b"Raw profile type exif\0\0" + zlib.compress(raw)),
-            (b"tEXt", b"Raw profile type exif\0" + raw),
-            (b"tEXt", keyword + b"\0" + packet(rng)),
-            (b"iTXt", keyword + b"\0\1\0\0\0" + bomb),
-            (b"iTXt", keyword + rng.choice((b"\0\0\0\0\0", b"\0\2\0", b"")) + packet(rng)),
+            (b"zTXt", b"Raw profile type exif\0\0" + bomb),
+            (b"iTXt", b"XML:com.adobe.xmp\0\1\0\0\0" + bomb),
             (b"eXIf", rng.choice((b"", b"Exif\0\0")) + tiff(rng)),
             (b"acTL", struct.pack(">II", rng.choice((0, 1, 2, 2**31)), 0)),
             (b"IHDR", struct.pack(">IIBBBBB", rng.choice(SIDES), rng.choice(SIDES), 8, 2, 0, 0, 0)),

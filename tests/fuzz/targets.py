@@ -134,20 +134,6 @@ def probe(folder: Path) -> Target:
     return Target(read, refusals, templates.make, 64)
 
 
-def export(folder: Path) -> Target:
-    """``api.http.transfer.open_export`` and the template inside."""
-    from api.http.transfer import open_export
-    from templates.contract import wire
-    from templates.errors import ContractMismatch, InvalidTemplate
-    from tests.fuzz.tensors import CONTRACT, KEY, TENANT, Exports
-
-    def read(data: bytes) -> None:
-        exported = open_export(data, key=KEY, tenant=TENANT, contract_id=CONTRACT)
-        wire.decode(exported.wire)
-
-    return Target(read, (InvalidTemplate, ContractMismatch), Exports().make, 64)
-
-
 def body(folder: Path) -> Target:
     """``api.http.bodies``: JSON and multipart bodies, up to the largest that are read."""
     from starlette.requests import Request
@@ -192,6 +178,5 @@ TARGETS: dict[str, Callable[[Path], Target]] = {
     "image": image,
     "template": template,
     "probe": probe,
-    "export": export,
     "body": body,
 }

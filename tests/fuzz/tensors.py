@@ -1,38 +1,23 @@
 """Hostile safetensors: templates, exports and decoy sources with headers and numbers that lie."""
 
-import base64
-import hashlib
 import json
 import random
 import struct
 from typing import Any
-from unittest import mock
 
 import numpy as np
 from numpy.typing import NDArray
 
-from api.http.transfer import MAGIC, PURPOSE, Exported, ExportKey, seal_export
 from templates.contract import wire
 from templates.keys.randomness import Keystream
-from templates.keys.sealing import MasterKeyring, Sealer
 from templates.space.subspace import SubspaceBatch
-from templates.store.schema import Source
 from tests.fuzz.documents import Raw, hostile
 from tests.fuzz.mutations import mutated, some, span
 
 CONTRACT = "ab" * 32
-TENANT = "fuzz"
-KEYRING = MasterKeyring([hashlib.sha256(b"fuzz").digest()], source="a test")
-SEALER = Sealer(KEYRING)
-KEY = ExportKey(KEYRING, tenant_bound=True)
 
 SPECIAL = (0.0, -0.0, 1.0, -1.0, 1.0001, 2.0, 1e-45, 1e-38, 6e4, 3e38, -3e38,
            float("nan"), float("inf"), -float("inf"))  # fmt: skip
-
-
-def repeatable(rng: random.Random) -> Any:
-    """While it holds, sealing takes its nonces from ``rng``: equal seeds give equal cases."""
-    return mock.patch("templates.keys.sealing.os.urandom", rng.randbytes)
 
 
 def subspace(n: int, m: int, seed: int = 0, *, norm: float = 0.5) -> SubspaceBatch:
@@ -131,34 +116,3 @@ class Templates:
         """One case."""
         data = rng.choice(self.large if rng.random() < 0.002 else self.sound)
         return hostile_tensors(rng, data, self.sound)
-
-
-class Exports:
-    """Makes cases for the reader of exports; half of them open with its key."""
-
-    def __init__(self) -> None:
-        self._inside = Templates()
-        self.header = {
-            "subject_id": "someone",
-            "source": "photos",
-            "photos": 3,
-            "holder_salt": "0" * 32,
-        }
-        one = Exported(
-            subject_id="someone", source=Source.PHOTOS, photos=1, wire=self._inside.sound[0]
-        )
-        with repeatable(random.Random(0)):
-            self.sound = [seal_export(one, key=KEY, contract_id=CONTRACT, tenant=TENANT)]
-
-    def make(self, rng: random.Random) -> bytes:
-        """One case."""
-        if rng.random() < 0.25:
-            return mutated(rng, rng.choice(self.sound), self.sound)
-        wire_bytes = base64.urlsafe_b64encode(self._inside.make(rng)).decode()
-        plain = hostile(rng, self.header | {"wire": wire_bytes})
-        if rng.random() < 0.1:
-            plain = mutated(rng, plain, [plain])
-        with repeatable(rng):
-            sealed = KEYRING.seal(plain, purpose=PURPOSE, bound_to=[CONTRACT, TENANT])
-        data = MAGIC + bytes.fromhex(CONTRACT) + sealed
-        return data if rng.random() < 0.9 else mutated(rng, data, self.sound)
