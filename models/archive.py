@@ -29,22 +29,15 @@ def is_archive(file: Path) -> bool:
         return True
 
 
-def unpack(archive: Path, into: Path) -> tuple[list[Path], list[str]]:
+def unpack(archive: Path, into: Path) -> int:
     """Extract the ``.onnx`` files and the ``pack.toml`` of a zip archive, flat, into a folder.
 
     Nothing else is written, whatever the archive holds: a file gets the last part of its entry's
     path as its name. Sizes are counted while bytes are written: what the archive says of them is
-    not trusted.
-
-    Returns
-    -------
-    files
-        What was written.
-    left_out
-        Names of the entries that were not.
+    not trusted. Returns how many entries were left out.
     """
     written: list[Path] = []
-    left_out: list[str] = []
+    left_out = 0
     room = MAX_TOTAL_BYTES
     try:
         with zipfile.ZipFile(archive) as opened:
@@ -54,7 +47,7 @@ def unpack(archive: Path, into: Path) -> tuple[list[Path], list[str]]:
             for entry in entries:
                 name = PurePosixPath(entry.filename.replace("\\", "/")).name
                 if name[:1] == "." or not (name.lower().endswith(".onnx") or name == FILE_NAME):
-                    left_out.append(entry.filename)
+                    left_out += 1
                     continue
                 # Other methods unpack to any size at once.
                 if not name.isprintable() or entry.compress_type not in _METHODS:
@@ -76,7 +69,7 @@ def unpack(archive: Path, into: Path) -> tuple[list[Path], list[str]]:
         ) from error
     if not any(file.suffix.lower() == ".onnx" for file in written):
         raise PackError("The archive has no .onnx file.")
-    return written, left_out
+    return left_out
 
 
 def _copy(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, target: Path, *, most: int) -> int:

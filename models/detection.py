@@ -197,31 +197,23 @@ def _inside_border(detector: Detector, image: NDArray[np.uint8], main: Size) -> 
     return [face.moved(offset, scale) for face in faces]
 
 
-def quarter_turns(detector: Detector, crop: NDArray[np.uint8]) -> int:
-    """Quarter turns to the left that put an aligned face (s, s, 3) upright; 0 where it is.
+def require_upright(detector: Detector, face: Face, crop: NDArray[np.uint8]) -> None:
+    """Refuse a face that is upside down or lies on its side, whatever else is asked of it.
 
-    The detector looks once at four small copies of the aligned crop, each turned by another right
-    angle: it is surest of the upright one.
+    Where the detector is less than sure of a face, it looks once at four small copies of the
+    aligned crop, each turned by another right angle: it is surest of the upright one.
     """
+    if face.score >= detector.clear_score:
+        return
     small = cv2.resize(crop, (_UPRIGHT_SIDE, _UPRIGHT_SIDE), interpolation=cv2.INTER_AREA)
     turned = [np.rot90(small, quarter) for quarter in range(4)]
     sheet = np.vstack([np.hstack(turned[:2]), np.hstack(turned[2:])])
     size: Size = detector.sizes[0] if detector.is_fixed else (2 * _UPRIGHT_SIDE, 2 * _UPRIGHT_SIDE)
     scores = np.zeros((2, 2))
-    for face in detector.detect_once(np.ascontiguousarray(sheet, dtype=np.uint8), size):
-        column, row = (face.box[:2] + face.box[2:]) / 2 >= _UPRIGHT_SIDE
-        scores[int(row), int(column)] = max(scores[int(row), int(column)], face.score)
-    return int(scores.argmax())
-
-
-def require_upright(detector: Detector, face: Face, crop: NDArray[np.uint8]) -> None:
-    """Refuse a face that is upside down or lies on its side, whatever else is asked of it.
-
-    A second look is taken only of a face that the detector is less than sure of.
-    """
-    if face.score >= detector.clear_score:
-        return
-    if turns := quarter_turns(detector, crop):
+    for seen in detector.detect_once(np.ascontiguousarray(sheet, dtype=np.uint8), size):
+        column, row = (seen.box[:2] + seen.box[2:]) / 2 >= _UPRIGHT_SIDE
+        scores[int(row), int(column)] = max(scores[int(row), int(column)], seen.score)
+    if turns := int(scores.argmax()):
         raise LowQuality(
             "The photo is upside down: turn it."
             if turns == 2

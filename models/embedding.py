@@ -1,6 +1,6 @@
 """Aligned crops → unit embeddings, by an ArcFace-like graph."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import cv2
@@ -39,15 +39,8 @@ class Preprocessing:
 
     def as_dict(self) -> dict[str, Any]:
         """JSON-able form, the one that contracts bind to."""
-        return {
-            "version": PREPROCESSING_VERSION,
-            "alignment": self.alignment,
-            "size": self.size,
-            "channel_order": self.channel_order,
-            "mean": list(self.mean),
-            "scale": list(self.scale),
-            "flip": self.flip,
-        }
+        numbers = {"mean": list(self.mean), "scale": list(self.scale)}
+        return {"version": PREPROCESSING_VERSION, **asdict(self), **numbers}
 
 
 class Embedder:

@@ -1,27 +1,4 @@
-"""``pack.toml``: what a pack says about itself where its graph cannot.
-
-::
-
-    [embedder]
-    mean = 127.5             # or one number per channel
-    scale = 127.5            # the input is (x - mean) / scale
-    channel_order = "rgb"    # or "bgr"
-    input_size = 112
-
-    [detector]
-    input_size = 640
-
-    [[liveness]]             # one for each liveness graph, by its file
-    file = "liveness.onnx"
-    crop_scale = 2.7         # sides of the crop over those of the face's box
-    crop = "box"             # or "square"
-    input_size = 80
-    channel_order = "bgr"    # or "rgb"
-    input_range = [0, 255]   # what the pixel values 0 and 255 become
-    live_class = 1
-
-Every key but ``file`` is optional; an unknown one is an error.
-"""
+"""``pack.toml``: what a pack says about itself where its graph cannot (docs/models.md)."""
 
 import tomllib
 from pathlib import Path

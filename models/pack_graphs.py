@@ -45,16 +45,6 @@ class PackGraph:
         """Name of the file."""
         return self.path.name
 
-    @property
-    def inputs(self) -> str:
-        """Names and shapes of the inputs."""
-        return ", ".join(map(str, self.session.inputs))
-
-    @property
-    def outputs(self) -> str:
-        """Names and shapes of the outputs."""
-        return ", ".join(map(str, self.session.outputs))
-
 
 def read_graphs(
     pack: Path, *, providers: Sequence[str] = ("cpu",), threads: int | None = None

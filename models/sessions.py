@@ -46,10 +46,6 @@ class Tensor:
     name: str
     shape: tuple[int | None, ...]
 
-    def __str__(self) -> str:
-        sizes = ", ".join("?" if size is None else str(size) for size in self.shape)
-        return f"{self.name}[{sizes}]"
-
 
 class Session:
     """One ONNX graph, loaded once, that any number of threads may run.

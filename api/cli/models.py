@@ -132,7 +132,7 @@ def inspect(
 
     Example: `veilface models inspect ~/.insightface/models/buffalo_l`
     """
-    names = ("file", "role", "reason", "sha256", "inputs", "outputs")
+    names = ("file", "role", "reason", "sha256")
     graphs = [{name: getattr(graph, name) for name in names} for graph in read_graphs(pack)]
     facts: dict[str, Any] = {"usable": True, "reason": None, "graphs": graphs, "pack": None}
     try:

@@ -53,7 +53,7 @@ def obtained(source: str, into: Path, *, sha256: str | None) -> tuple[str, int]:
                 f"{shown(source)} has SHA-256 {digest}, and not the one of --sha256: do not use it"
             )
         if is_archive(Path(draft.name)):
-            return digest, len(unpack(Path(draft.name), into)[1])
+            return digest, unpack(Path(draft.name), into)
         name = Path(httpx.URL(source).path if _is_address(source) else source).name
         if not _GRAPH_NAME.fullmatch(name):
             raise CommandError(

@@ -39,11 +39,9 @@ def test_graphs_and_the_pack_file_are_taken_flat(tmp_path: Path) -> None:
         ("run.py", b"import os"),
     )
     into = target(tmp_path)
-    files, left_out = unpack(path, into)
-    assert sorted(file.name for file in files) == ["det.onnx", "pack.toml", "rec.ONNX"]
-    assert sorted(into.iterdir()) == sorted(files)
+    assert unpack(path, into) == 3
+    assert sorted(file.name for file in into.iterdir()) == ["det.onnx", "pack.toml", "rec.ONNX"]
     assert (into / "det.onnx").read_bytes() == GRAPH
-    assert left_out == ["buffalo/README.md", "__MACOSX/buffalo/._det.onnx", "run.py"]
 
 
 @pytest.mark.parametrize(
@@ -51,16 +49,18 @@ def test_graphs_and_the_pack_file_are_taken_flat(tmp_path: Path) -> None:
 )
 def test_a_path_that_leads_out_of_the_archive_does_not(tmp_path: Path, entry: str) -> None:
     into = target(tmp_path)
-    assert unpack(zipped(tmp_path, (entry, GRAPH)), into)[0] == [into / "det.onnx"]
+    unpack(zipped(tmp_path, (entry, GRAPH)), into)
+    assert list(into.iterdir()) == [into / "det.onnx"]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["into", "pack.zip"]
 
 
 def test_a_link_is_written_as_a_file(tmp_path: Path) -> None:
     entry = zipfile.ZipInfo("det.onnx")
     entry.external_attr = (stat.S_IFLNK | 0o777) << 16
-    files, _ = unpack(zipped(tmp_path, (entry, b"/etc/passwd")), target(tmp_path))
-    assert not files[0].is_symlink()
-    assert files[0].read_bytes() == b"/etc/passwd"
+    into = target(tmp_path)
+    unpack(zipped(tmp_path, (entry, b"/etc/passwd")), into)
+    assert not (into / "det.onnx").is_symlink()
+    assert (into / "det.onnx").read_bytes() == b"/etc/passwd"
 
 
 @pytest.mark.parametrize(

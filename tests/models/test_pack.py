@@ -168,7 +168,6 @@ def test_inspect_reports_also_what_cannot_be_loaded(tmp_path, mbf_pack_dir):
     assert [r.role for r in reports.values()] == [Role.EMBEDDER, Role.EMBEDDER, Role.UNUSED]
     assert "gender and age" in reports["g.onnx"].reason
     real = {report.file: report for report in read_graphs(mbf_pack_dir)}
-    assert real["w600k_mbf.onnx"].inputs == "input[?, 3, 112, 112]"
     digest = hashlib.sha256((mbf_pack_dir / "w600k_mbf.onnx").read_bytes()).hexdigest()
     assert real["w600k_mbf.onnx"].sha256 == digest
 
