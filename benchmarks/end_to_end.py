@@ -54,7 +54,7 @@ def measure(args: argparse.Namespace) -> list[dict[str, object]]:
             m = client.contract().binding["m"]
         seconds = time.perf_counter() - started
         keyring = MasterKeyring.load(Path(service.env["VEILFACE_MASTER_KEY_FILE"]))
-    cache = EmbeddingCache.open_file(args.work / "cache.veil", Sealer(keyring))
+    cache = EmbeddingCache(args.work / "cache.veil", Sealer(keyring))
     run = {"level": args.level, "enrolled": args.enrolled, "shown": args.burst}
     means = "lifted probes" if args.private else "photos"
     raw = raw_counts(args, people, cache)

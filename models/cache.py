@@ -35,31 +35,21 @@ class CacheSealer(Protocol):
 class EmbeddingCache:
     """Embeddings by a 32-byte key; safe from several threads.
 
-    Use it bare to keep them in memory, or `open_file` to keep them between runs, in a sealed npz
-    with an array of keys, uint8 (k, 32), and one of embeddings, float32 (k, n), for each n.
+    They are kept in memory, and with a path in a file too: a sealed npz with an array of keys,
+    uint8 (k, 32), and one of embeddings, float32 (k, n), for each n.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, path: str | Path | None = None, sealer: CacheSealer | None = None) -> None:
         self._entries: dict[bytes, NDArray[np.float32]] = {}
-        self._path: Path | None = None
-        self._sealer: CacheSealer | None = None
+        self._path = None if path is None else Path(path)
+        self._sealer = sealer
         self._changed = False
         self._lock = threading.Lock()
-
-    @classmethod
-    def open_file(cls, path: str | Path, sealer: CacheSealer) -> "EmbeddingCache":
-        """Open an encrypted cache file, or start one where there is none."""
-        cache = cls()
-        cache._path, cache._sealer = Path(path), sealer
-        if cache._path.exists():
-            cache._entries = _unpacked(sealer.open(cache._path.read_bytes(), context=CONTEXT))
-        return cache
+        if self._path is not None and sealer is not None and self._path.exists():
+            self._entries = _unpacked(sealer.open(self._path.read_bytes(), context=CONTEXT))
 
     def __len__(self) -> int:
         return len(self._entries)
-
-    def __repr__(self) -> str:
-        return f"EmbeddingCache({len(self)} entries)"
 
     def get(self, key: bytes) -> NDArray[np.float32] | None:
         """Embedding of ``key``, float32, shape (n,), or ``None``."""

@@ -1,7 +1,7 @@
 """Is this face good enough to enroll or to verify? Measures, limits, and named refusals."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -33,18 +33,18 @@ _NEUTRAL_NOSE = 0.545
 class Quality:
     """What was measured on one face; None where it came aligned, and nothing was detected."""
 
-    score: float | None  # confidence of the detector, 0...1
-    face_size: float | None  # shorter side of the box in pixels
+    score: float | None = None  # confidence of the detector, 0...1
+    face_size: float | None = None  # shorter side of the box in pixels
     sharpness: float  # `measure_sharpness`: about 3 for a sharp photo, below 0.5 useless
     brightness: float  # mean luma of the centre of the aligned crop, 0...255
     exposure: float  # luma that a twentieth of the whole picture exceeds: it knows no skin
-    yaw: float | None  # degrees, see `measure_pose`
-    pitch: float | None
-    roll: float | None
+    yaw: float | None = None  # degrees, see `measure_pose`
+    pitch: float | None = None
+    roll: float | None = None
     # Least distance of the five points from the border of the picture, as a share of the crop's
     # side; negative where a point lies outside.
-    border: float | None
-    aspect: float | None  # height of the box over its width
+    border: float | None = None
+    aspect: float | None = None  # height of the box over its width
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,22 +74,23 @@ def measure(crop: NDArray[np.uint8], face: Face | None, image: NDArray[np.uint8]
     grey = cv2.cvtColor(crop, cv2.COLOR_RGB2GRAY)
     if grey.shape != (_SIDE, _SIDE):
         grey = cv2.resize(grey, (_SIDE, _SIDE), interpolation=cv2.INTER_AREA)
-    yaw = pitch = roll = border = aspect = None
-    if face is not None:
-        yaw, pitch, roll = measure_pose(face.keypoints)
-        border = _border(face.keypoints, image.shape)
-        aspect = face.height / face.width
-    return Quality(
-        score=None if face is None else face.score,
-        face_size=None if face is None else min(face.width, face.height),
+    quality = Quality(
         sharpness=measure_sharpness(np.asarray(grey, dtype=np.uint8)),
         brightness=float(grey[_MARGIN:-_MARGIN, _MARGIN:-_MARGIN].mean()),
         exposure=_exposure(image),
+    )
+    if face is None:
+        return quality
+    yaw, pitch, roll = measure_pose(face.keypoints)
+    return replace(
+        quality,
+        score=face.score,
+        face_size=min(face.width, face.height),
         yaw=yaw,
         pitch=pitch,
         roll=roll,
-        border=border,
-        aspect=aspect,
+        border=_border(face.keypoints, image.shape),
+        aspect=face.height / face.width,
     )
 
 

@@ -59,7 +59,7 @@ def make_material(
     pack = ModelPack.load(pack_dir, threads=2)
     keyring = MasterKeyring.create(folder / "master.key")
     sealer = Sealer(keyring)
-    cache = EmbeddingCache.open_file(folder / "cache.veil", sealer)
+    cache = EmbeddingCache(folder / "cache.veil", sealer)
     names = sorted(path.name for path in people.iterdir())
     sitters = list(islice((name for name in names if _usable(pack, people / name)), PEOPLE))
     others = [name for name in names if name not in sitters]

@@ -95,7 +95,7 @@ class Bulk:
         if self.cache_file is None:
             return None
         self.cache_file.parent.mkdir(parents=True, exist_ok=True)
-        return EmbeddingCache.open_file(self.cache_file, self.sealer)
+        return EmbeddingCache(self.cache_file, self.sealer)
 
     def extract(self, photos: Sequence[Path]) -> Extraction:
         """Embed photos; those that fail are counted, reported and left out."""

@@ -83,7 +83,7 @@ def fetch(
     message(
         f"{name}: not a pack that Veilface knows; its licence is between you and its owner."
         if known is None
-        else f"{name}: {known.contents}; {known.megabytes:g} MB; licence: {known.licence}."
+        else f"{name}: {known.contents}; licence: {known.licence}."
     )
     if not sources:
         raise UsageError(

@@ -28,11 +28,11 @@ def vector(seed: int, n: int = 8) -> np.ndarray:
 
 def test_file_round_trip_with_packs_of_different_size(tmp_path):
     path = tmp_path / "embeddings.cache"
-    cache = EmbeddingCache.open_file(path, Xor())
+    cache = EmbeddingCache(path, Xor())
     for seed in range(5):
         cache.put(bytes([seed]) * 32, vector(seed, 8 if seed % 2 else 16))
     cache.flush()
-    again = EmbeddingCache.open_file(path, Xor())
+    again = EmbeddingCache(path, Xor())
     assert len(again) == 5
     for seed in range(5):
         np.testing.assert_array_equal(
@@ -43,7 +43,7 @@ def test_file_round_trip_with_packs_of_different_size(tmp_path):
 
 def test_no_embedding_lies_on_disk_in_the_clear(tmp_path):
     path = tmp_path / "embeddings.cache"
-    cache = EmbeddingCache.open_file(path, Xor())
+    cache = EmbeddingCache(path, Xor())
     cache.put(b"k" * 32, vector(3))
     cache.flush()
     assert [file.name for file in tmp_path.iterdir()] == ["embeddings.cache"]
@@ -56,7 +56,7 @@ def test_no_embedding_lies_on_disk_in_the_clear(tmp_path):
 
 def test_a_failed_write_keeps_the_old_file_and_leaves_nothing_behind(tmp_path, monkeypatch):
     path = tmp_path / "embeddings.cache"
-    cache = EmbeddingCache.open_file(path, Xor())
+    cache = EmbeddingCache(path, Xor())
     cache.put(b"a" * 32, vector(1))
     cache.flush()
     before = path.read_bytes()
@@ -97,4 +97,4 @@ def test_opened_content_is_checked(tmp_path, content):
     path = tmp_path / "embeddings.cache"
     path.write_bytes(Xor().seal(content, context=CONTEXT))
     with pytest.raises(CacheError, match="delete it"):
-        EmbeddingCache.open_file(path, Xor())
+        EmbeddingCache(path, Xor())

@@ -185,7 +185,7 @@ def test_the_licence_is_asked_for(site: Site, graph: bytes) -> None:
     known = KNOWN_PACKS["buffalo_l"]
     refused = run("models", "fetch", "buffalo_l", "--from", f"{site.url}/rec.onnx")
     assert refused.status == 2
-    assert f"{known.megabytes:g} MB; licence: non-commercial research only" in refused.stderr
+    assert f"{known.contents}; licence: non-commercial research only" in refused.stderr
     assert "--accept-licence" in refused.stderr
     assert site.asked == []
 
