@@ -16,20 +16,12 @@ MAX_CANDIDATES = 1000
 class Face:
     """One detected face, in pixels of the upright image.
 
-    Attributes
-    ----------
-    box
-        float32, shape (4,): x1, y1, x2, y2. May reach over the image's border.
-    score
-        Confidence of the detector, 0...1; detectors differ in what a value means.
-    keypoints
-        float32, shape (5, 2): left eye, right eye, nose, left and right mouth corner as the viewer
-        sees them.
+    The points are left eye, right eye, nose, left and right mouth corner as the viewer sees them.
     """
 
-    box: NDArray[np.float32]
-    score: float
-    keypoints: NDArray[np.float32]
+    box: NDArray[np.float32]  # (4,): x1, y1, x2, y2; it may reach over the image's border
+    score: float  # confidence, 0...1; detectors differ in what a value means
+    keypoints: NDArray[np.float32]  # (5, 2)
 
     def moved(self, offset: NDArray[np.float32], scale: NDArray[np.float32]) -> "Face":
         """The face in a picture that begins at ``offset`` of this one, and is ``scale`` finer."""

@@ -150,7 +150,7 @@ def _open(data: bytes) -> tuple[Image.Image, int]:
     try:
         image = Image.open(io.BytesIO(head.data), formats=FORMATS)
     except UnidentifiedImageError:
-        raise ImageError("unsupported_image", unread_file(data)) from None
+        raise unread_file(data) from None
     _check_size(image.width, image.height)
     if getattr(image, "is_animated", False):
         raise animated("WebP")

@@ -12,23 +12,12 @@ from models.quality import Quality
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FaceCrop:
-    """One face of a photo; the photo itself is not kept, and ``repr`` shows no pixel.
+    """One face of a photo; the photo itself is not kept, and ``repr`` shows no pixel."""
 
-    Attributes
-    ----------
-    crop
-        Aligned, RGB uint8, shape (s, s, 3).
-    face
-        As it was detected; ``None`` for crops that came aligned.
-    liveness
-        How live the face looks (`PassiveLiveness.score`); ``None`` where it was not asked for.
-    picture
-        SHA-256 of the decoded photo; ``None`` where it was not asked for.
-    """
-
-    crop: NDArray[np.uint8] = field(repr=False)
+    crop: NDArray[np.uint8] = field(repr=False)  # aligned, RGB, (s, s, 3)
     quality: Quality
-    face: Face | None = field(repr=False)
+    face: Face | None = field(repr=False)  # as it was detected; None where it came aligned
+    # How live it looks, and the SHA-256 of the decoded photo; None where it was not asked for.
     liveness: float | None = None
     picture: bytes | None = field(default=None, repr=False)
 

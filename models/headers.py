@@ -164,13 +164,14 @@ def animated(name: str) -> ImageError:
     )
 
 
-def unread_file(data: bytes) -> str:
-    """Return the sentence that refuses a file, and names what phones send most often."""
-    if _PHONE_PICTURE.match(data[:512]):
-        return (
-            "The file is a HEIC or AVIF picture, which is not read: save it as JPEG, and send that."
-        )
-    return "The file is not a JPEG, PNG, WebP or BMP picture, or is damaged."
+def unread_file(data: bytes) -> ImageError:
+    """Return the refusal of a file, which names what phones send most often."""
+    return ImageError(
+        "unsupported_image",
+        "The file is a HEIC or AVIF picture, which is not read: save it as JPEG, and send that."
+        if _PHONE_PICTURE.match(data[:512])
+        else "The file is not a JPEG, PNG, WebP or BMP picture, or is damaged.",
+    )
 
 
 def _too_many(name: str, most: int, parts: str) -> ImageError:

@@ -37,13 +37,13 @@ class DetectorInfo:
 
 @dataclass(frozen=True)
 class PackInfo:
-    """What identifies a pack."""
+    """What identifies a pack; embedder and preprocessing decide which embeddings compare."""
 
     name: str
     n: int
     embedder_file: Path
     embedder_sha256: str
-    preprocessing: dict[str, Any]  # with the hash it decides whether embeddings are comparable
+    preprocessing: dict[str, Any]
     detector: DetectorInfo | None  # None where the pack takes aligned crops only
 
 
