@@ -190,20 +190,3 @@ def test_the_embeddings_file_of_the_page_is_read(
     exec(compile(code, "docs/formats.md", "exec"), names)
     made = read_embeddings(tmp_path / "lfw.npz")
     assert made.embeddings.shape == (len(made.paths), 4)
-
-
-def test_what_is_planted_is_reported(tmp_path: Path) -> None:
-    (tmp_path / "docs").mkdir()
-    (tmp_path / "README.md").write_text("# It\n\n[page](docs/page.md#there)\n")
-    (tmp_path / "docs" / "page.md").write_text(
-        "# There\n\n1. one\n\n   ```sh\n   veilface serve --nope\n   ```\n\n"
-        "```sh\nKEY=$(veilface keys create --right enrol)\nsudo veilface lift a.jpg | cat\n"
-        "x | veilface frobnicate\n```\n\n"
-        "[a](gone.md) [c](../README.md#it)\n"
-    )
-    nope, enrol, pack, frobnicate = refused_commands(tmp_path)
-    assert "No such option: --nope" in nope
-    assert "'enrol' is not one of" in enrol
-    assert "Missing option '--pack'" in pack
-    assert "no such command" in frobnicate
-    assert broken_files(tmp_path) == ["docs/page.md: gone.md"]

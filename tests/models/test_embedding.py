@@ -40,12 +40,6 @@ def test_rows_are_the_normalised_output_whatever_the_batch(count, seed):
     assert rows.flags.c_contiguous
 
 
-def test_flip_adds_the_raw_embedding_of_the_mirror_before_normalising():
-    pictures = crops(5)
-    expected = unit(pooled(pictures) + pooled(pictures[:, :, ::-1]))
-    np.testing.assert_allclose(POOLING.embed(pictures, flip=True), expected, atol=2e-5)
-
-
 def test_a_fixed_batch_is_filled_up():
     fixed = embedder(pooling_embedder(batch=4))
     pictures = crops(6)
