@@ -40,12 +40,11 @@ class LivenessGraph:
     """
 
     def __init__(self, graph: PackGraph, stated: LivenessStatement) -> None:
-        height, width = image_size(graph.session.inputs) or (None, None)
-        size = height or stated.input_size
-        if height != width or size is None or stated.input_size not in (None, size):
+        size, width = image_size(graph.session.inputs) or (None, None)
+        if size is None or size != width:
             raise PackError(
-                f"{graph.path} takes {width or 'any'} x {height or 'any'} pixels; a liveness graph"
-                " takes a square, and input_size in pack.toml states the side where it is open."
+                f"{graph.path} takes {width or 'any'} x {size or 'any'} pixels; a liveness graph"
+                " takes a square of a fixed size."
             )
         in_name = _SCALE_IN_NAME.search(graph.path.stem)
         crop_scale = stated.crop_scale or (float(in_name[1]) if in_name else None)

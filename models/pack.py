@@ -281,13 +281,7 @@ class ModelPack:
 
 def _embedder(graph: PackGraph, pack_file: PackFile, flip: bool) -> Embedder:
     stated = pack_file.embedder
-    fixed, _ = image_size(graph.session.inputs) or (None, None)
-    side = fixed or stated.input_size or 0
-    if stated.input_size not in (None, side):
-        raise PackError(
-            f"pack.toml states input_size {stated.input_size}, and {graph.path} takes {fixed}"
-            " only; remove the key."
-        )
+    side = (image_size(graph.session.inputs) or (None, None))[0] or 0
     try:
         is_inside = None in (stated.mean, stated.scale) and normalises_inside(graph.session, side)
         mean, scale = (0.0, 1.0) if is_inside else (127.5, 127.5)

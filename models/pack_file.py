@@ -49,7 +49,6 @@ class EmbedderStatement(_Table):
     mean: Mean | None = None
     scale: Scale | None = None
     channel_order: ChannelOrder | None = None
-    input_size: Annotated[int, Field(ge=112, le=2048, multiple_of=16)] | None = None
 
 
 class DetectorStatement(_Table):
@@ -64,7 +63,6 @@ class LivenessStatement(_Table):
     file: Annotated[str, Field(min_length=1)]
     crop_scale: Annotated[float, Field(ge=0.5, le=8)] | None = None
     crop: CropShape = "box"
-    input_size: Annotated[int, Field(ge=16, le=2048)] | None = None
     channel_order: ChannelOrder = "bgr"
     input_range: Range = (0.0, 255.0)
     live_class: Annotated[int, Field(ge=0, le=15)] = 1

@@ -94,9 +94,7 @@ def _read_graph(
     if stated.liveness_of(path.name) is not None:
         role, reason = Role.LIVENESS, "stated in pack.toml"
     else:
-        role, reason = classify(
-            session.inputs, session.outputs, input_size=stated.embedder.input_size
-        )
+        role, reason = classify(session.inputs, session.outputs)
     return PackGraph(path, session, hashlib.sha256(model).hexdigest(), role, reason)
 
 
@@ -107,9 +105,7 @@ def image_size(inputs: Sequence[Tensor]) -> tuple[int | None, int | None] | None
     return inputs[0].shape[2], inputs[0].shape[3]
 
 
-def classify(
-    inputs: Sequence[Tensor], outputs: Sequence[Tensor], *, input_size: int | None = None
-) -> tuple[Role, str]:
+def classify(inputs: Sequence[Tensor], outputs: Sequence[Tensor]) -> tuple[Role, str]:
     """Route a graph by its signature (docs/models.md "Packs")."""
     size = image_size(inputs)
     widths = sorted(output.shape[-1] or 0 if output.shape else 0 for output in outputs)
@@ -131,10 +127,10 @@ def classify(
             return Role.LIVENESS, "80 x 80 input and 3 output values (MiniFASNet)"
         case (192, 192), _:
             return Role.UNUSED, "192 x 192 input: landmarks"
-    height, width = (input_size if side is None else side for side in size)
+    height, width = size
     reason = None
     if height is None or width is None:
-        reason = "the input size is open; where this is an embedder, state input_size in pack.toml"
+        reason = "the input size is open; where this is an embedder, export it with its own size"
     elif height != width or height < 112 or height % 16:
         reason = f"the {width} x {height} input is not a square of at least 112 that 16 divides"
     elif len(outputs) != 1 or len(outputs[0].shape) != 2:

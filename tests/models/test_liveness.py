@@ -24,6 +24,7 @@ BOX = (30.0, 25.0, 80.0, 95.0)
 WEIGHTS = np.array([[0.0, 0.02, 0.0], [0.0, 0.0, 0.0], [0.02, 0.0, 0.0]])
 NAMED = "2.7_80x80_net"
 NET = mean_liveness(WEIGHTS)
+OPEN = mean_liveness(WEIGHTS, size="side")
 TWO = mean_liveness(np.array([[2.0, 0.0], [0.0, 1.0], [0.0, 0.0]]), size=64)
 
 
@@ -188,7 +189,7 @@ def test_the_scale_in_the_name_that_the_authors_give(tmp_path, name, scale):
         ("", {"net": NET}, r"net\.onnx.*crop_scale in pack\.toml"),
         (stated(file='"gone.onnx"'), {NAMED: NET}, r"gone\.onnx"),
         (stated(file=f'"{NAMED}.onnx"', live_class=3), {NAMED: NET}, "3 classes.*live_class 3"),
-        (stated(file=f'"{NAMED}.onnx"', input_size=96), {NAMED: NET}, "takes 80 x 80"),
+        (stated(file='"open.onnx"', crop_scale=2), {"open": OPEN}, "takes any x any pixels"),
         (stated(file='"emb.onnx"', crop_scale=2), {}, "no embedder"),
     ],
 )

@@ -110,21 +110,6 @@ def test_pack_toml_overrides_what_the_graph_says(tmp_path):
     assert pack.info.preprocessing["channel_order"] == "bgr"
 
 
-def test_pack_toml_states_an_open_input_size(tmp_path):
-    folder = write_pack(tmp_path, e=pooling_embedder("side"))
-    with pytest.raises(PackError, match=r"input_size in pack\.toml"):
-        ModelPack.load(folder)
-    (folder / "pack.toml").write_text("[embedder]\ninput_size = 128\n")
-    assert ModelPack.load(folder).crop_size == 128
-
-
-def test_pack_toml_cannot_contradict_the_graph(tmp_path):
-    folder = write_pack(tmp_path, e=pooling_embedder())
-    (folder / "pack.toml").write_text("[embedder]\ninput_size = 128\n")
-    with pytest.raises(PackError, match="takes 112 only"):
-        ModelPack.load(folder)
-
-
 def test_flip_of_the_pack_is_part_of_the_preprocessing_and_is_used(tmp_path):
     folder = write_pack(tmp_path, e=pooling_embedder())
     pack = ModelPack.load(folder, flip=True)

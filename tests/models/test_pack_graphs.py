@@ -26,6 +26,7 @@ YUNET = [f"{role}_{stride}" for role in ("cls", "obj", "bbox", "kps") for stride
         (IMAGE, [(1, 512)], Role.EMBEDDER),
         ((None, 3, 128, 128), [(None, 256)], Role.EMBEDDER),
         ((None, None, 112, 112), [(None, None)], Role.EMBEDDER),
+        ((None, 3, None, None), [(None, 512)], Role.UNUSED),
         (IMAGE, [(1, 512), (1, 512)], Role.UNUSED),
         (IMAGE, [(1, 512, 1, 1)], Role.UNUSED),
         (IMAGE, [()], Role.UNUSED),
@@ -45,14 +46,6 @@ def test_routing_by_signature(image, outputs, role):
     made = [Tensor(f"o{place}", shape) for place, shape in enumerate(outputs)]
     assert classify([Tensor("data", image)], made)[0] is role
     assert classify([Tensor("data", image)] * 2, made)[0] is Role.UNUSED
-
-
-def test_an_open_input_size_is_an_embedder_once_it_is_stated():
-    image, embedding = [Tensor("data", (None, 3, None, None))], [Tensor("e", (None, 512))]
-    role, reason = classify(image, embedding)
-    assert role is Role.UNUSED
-    assert "pack.toml" in reason
-    assert classify(image, embedding, input_size=112)[0] is Role.EMBEDDER
 
 
 @pytest.mark.parametrize(
