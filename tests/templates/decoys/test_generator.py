@@ -245,22 +245,6 @@ METADATA = b'"__metadata__":{"veilface":"{\\"format\\":\\"%s\\",\\"version\\":2}
         with_header(b"{" + METADATA + b"}"),
         with_header(b'{"__metadata__":{"veilface":"[]"}}'),
         with_header(b"\xff\xfe"),
-        # Shapes and offsets that would allocate, overflow or lie outside the file.
-        *(
-            with_header(
-                b"{" + METADATA + b',"mean":{"dtype":"F32","shape":%s,"data_offsets":%s}}' % pair,
-                bytes(16),
-            )
-            for pair in (
-                (b"[4000000000]", b"[0,16000000000]"),
-                (b"[-4]", b"[0,16]"),
-                (b"[4]", b"[16,0]"),
-                (b"[4.0]", b"[0,16]"),
-                (b"[true]", b"[0,4]"),
-                (b"[1,1,1,1,4]", b"[0,16]"),
-                (b"[99999999999999999999999]", b"[0,16]"),
-            )
-        ),
     ],
 )
 def test_hostile_headers_are_refused(data: bytes) -> None:

@@ -2,7 +2,6 @@
 
 import os
 import stat
-import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -115,21 +114,11 @@ def test_one_byte_more_than_the_limit_tells_of_a_larger_file(
         assert read_at_most(file, most) == content[: most + 1]
 
 
-@pytest.mark.parametrize(("size", "most"), [(3 * 2**20, 2**30), (3 * 2**20, 2**20), (0, 5)])
-def test_a_pipe_which_has_no_size_is_read_as_well(size: int, most: int) -> None:
-    content = os.urandom(size)
+@pytest.mark.parametrize("most", [2**30, 4_000, 1_000])
+def test_a_pipe_which_has_no_size_is_read_as_well(most: int) -> None:
+    content = os.urandom(4_000)  # fits into the smallest pipe
     reading, writing = os.pipe()
-
-    def write() -> None:
-        with os.fdopen(writing, "wb") as file:
-            try:
-                file.write(content)
-                file.flush()
-            except BrokenPipeError:
-                pass
-
-    thread = threading.Thread(target=write)
-    thread.start()
+    os.write(writing, content)
+    os.close(writing)
     with os.fdopen(reading, "rb") as file:
         assert read_at_most(file, most) == content[: most + 1]
-    thread.join()
