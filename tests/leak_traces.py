@@ -473,8 +473,8 @@ def _open_the_store(traces: ServiceTraces) -> None:
     with engine.connect() as connection:
         row = connection.execute(
             sa.text(
-                "SELECT s.id, t.template_id, t.ciphertext, s.wrapped_key FROM subjects s "
-                "JOIN templates t ON t.subject_pk = s.id WHERE s.subject_id = :subject"
+                "SELECT id, template_id, ciphertext, wrapped_key FROM subjects "
+                "WHERE subject_id = :subject"
             ),
             {"subject": traces.subjects[0]},
         ).one()

@@ -230,7 +230,7 @@ def test_a_holders_key_is_kept_nowhere(traces: ServiceTraces) -> None:
         assert not any(form in traces.database_bytes(moment) for form in forms)
     assert not any(form in traces.answers for form in forms)
     # The control: what a template needs the key for is there.
-    salts = [row for row in traces.values["stopped"]["templates"] if b"None" not in row]
+    salts = [row for row in traces.values["stopped"]["subjects"] if b"None" not in row]
     assert len(salts) == 1
 
 
@@ -291,7 +291,6 @@ def test_before_the_erasure_the_person_was_there(traces: ServiceTraces) -> None:
     victim = traces.victim
     assert text_rows(traces, "running", victim.row_id, victim.subject_id, victim.pseudonym) == {
         "subjects": 1,
-        "templates": 1,
         "failed_attempts": 1,
         "audit_log": 3,
     }

@@ -5,23 +5,20 @@ import os
 import threading
 from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
-from functools import cache
 from importlib.metadata import version
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import anyio
 import anyio.to_thread
-from fastapi import APIRouter, Depends, FastAPI, Request
+from fastapi import Depends, FastAPI, Request
 from fastapi.exceptions import RequestValidationError
-from fastapi.routing import iter_route_contexts
 from starlette.exceptions import HTTPException
 from starlette.middleware.cors import CORSMiddleware
-from starlette.routing import BaseRoute
 
 from api.http.context import RequestContext
 from api.http.deps import refuse_unknown
 from api.http.errors import StartError
-from api.http.openapi import ERRORS, describe, operation_id
+from api.http.openapi import DESCRIPTION, ERRORS, TAGS, operation_id
 from api.http.routes import (
     audit_log,
     challenges,
@@ -73,7 +70,6 @@ CORS_REQUEST_HEADERS = (
     "Content-Type",
     "If-Match",
     "If-None-Match",
-    "Veilface-Holder-Key",
     "X-Request-ID",
 )
 CORS_ANSWER_HEADERS = (
@@ -102,12 +98,27 @@ def create_app(
                 raise
             yield
 
-    app = FastAPI(lifespan=lifespan, openapi_url=None, redirect_slashes=False)
-    app.openapi = _document  # type: ignore[method-assign]
+    app = FastAPI(
+        title="Veilface",
+        version=VERSION,
+        description=DESCRIPTION,
+        openapi_tags=[*TAGS],
+        openapi_url=None,
+        redirect_slashes=False,
+        lifespan=lifespan,
+        dependencies=[Depends(refuse_unknown)],
+        responses=ERRORS,
+        generate_unique_id_function=operation_id,
+        exception_handlers={HTTPException: _pass_on, RequestValidationError: _pass_on},
+    )
     app.state.settings = settings
+    for module in API:
+        app.include_router(module.router)
+    # Now, and not for a first request: the framework makes it under filters of its own for
+    # warnings, which are the process's. A photo that is decoded meanwhile would change them.
+    document = app.openapi()
     routes = app.router.routes
-    routes += _built()
-    routes += document_routes(_document(), root_path=settings.root_path)
+    routes += document_routes(document, root_path=settings.root_path)
     if settings.web_page:
         routes += page_routes(demo=settings.demo, serve_pack=settings.serve_pack)
         routes += reference_routes()
@@ -115,29 +126,6 @@ def create_app(
             routes += drawn_people_routes()
     _add_middleware(app, settings)
     return app
-
-
-@cache
-def _built() -> tuple[BaseRoute, ...]:
-    """The routes of the calls, built now, and once for a process.
-
-    By itself the framework builds them for the first request to any, under filters of its own for
-    warnings. Those are the process's: a photo that is decoded meanwhile would change them.
-    """
-    router = APIRouter(generate_unique_id_function=operation_id)
-    for module in API:
-        router.include_router(
-            module.router, dependencies=[Depends(refuse_unknown)], responses=ERRORS
-        )
-    for _ in iter_route_contexts(router.routes):
-        pass
-    return tuple(router.routes)
-
-
-@cache
-def _document() -> dict[str, Any]:
-    """The OpenAPI document, made now and once for a process, for the reason of :func:`_built`."""
-    return describe(_built(), version=VERSION)
 
 
 def _lift_cohort(nobody: Nobody) -> None:
@@ -166,8 +154,6 @@ def _add_middleware(app: FastAPI, settings: Settings) -> None:
             allow_headers=CORS_REQUEST_HEADERS,
             expose_headers=CORS_ANSWER_HEADERS,
         )
-    for kind in (HTTPException, RequestValidationError):
-        app.add_exception_handler(kind, _pass_on)
 
 
 async def _open(

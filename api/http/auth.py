@@ -156,9 +156,7 @@ def _recognised(runtime: Runtime, text: str) -> tuple[ApiKey | None, SubjectToke
     if key is None:
         return None, None
     found = opened(SubjectToken, sealed, runtime.keyring, TOKEN_PURPOSE, [key.id])
-    if found is None:
-        return None, None
-    return key, found
+    return (None, None) if found is None else (key, found)
 
 
 AnyCall = Annotated[Call, Depends(call_of)]

@@ -1,12 +1,9 @@
 """What OpenAPI says of calls, errors and request bodies, which FastAPI cannot say by itself."""
 
-from collections.abc import Sequence
 from typing import Any
 
-from fastapi.openapi.utils import get_openapi
 from fastapi.routing import APIRoute
 from pydantic import BaseModel
-from starlette.routing import BaseRoute
 
 from api.http.schemas import ErrorAnswer
 
@@ -33,13 +30,6 @@ def operation_id(route: APIRoute) -> str:
     """Name an operation after its function: ``erase_subject`` is ``eraseSubject``."""
     first, *rest = route.name.split("_")
     return first + "".join(word.capitalize() for word in rest)
-
-
-def describe(routes: Sequence[BaseRoute], *, version: str) -> dict[str, Any]:
-    """Make the OpenAPI document of routes."""
-    return get_openapi(
-        title="Veilface", version=version, description=DESCRIPTION, tags=[*TAGS], routes=routes
-    )
 
 
 def body_of(

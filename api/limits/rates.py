@@ -39,17 +39,10 @@ through all counters at a request: 10,000 take a millisecond."""
 
 
 class RateLimits:
-    """The limits in force, of one worker.
+    """The limits in force, of one worker: most requests, as ``600/minute``, or ``off``.
 
-    Parameters
-    ----------
-    key, address
-        Most requests of one API key and of one client address, as ``600/minute``, or ``off``.
-    redis_url
-        Where workers count together; None to count in this process. It may hold a password, which
-        no message repeats.
-    prefix
-        What the names of all keys in Redis begin with.
+    Workers count together where there is a ``redis_url``, which no message repeats: it may hold a
+    password. ``prefix`` is what the names of all keys in Redis begin with.
     """
 
     def __init__(
@@ -63,9 +56,7 @@ class RateLimits:
         self._own_counters = MemoryStorage()
         self._own = SlidingWindowCounterRateLimiter(self._own_counters)
         self._redis = None if redis_url is None else _opened(redis_url, prefix)
-        self._shared = self._own
-        if self._redis is not None:
-            self._shared = SlidingWindowCounterRateLimiter(self._redis)
+        self._shared = SlidingWindowCounterRateLimiter(self._redis or self._own_counters)
         self._failed = False
         self._try_again_at = -math.inf
 

@@ -15,8 +15,7 @@ ENROLLED = range(1, 9)
 """Whom `veilface demo` enrolls first, by the numbers that their faces are drawn from."""
 STRANGERS = range(101, 107)
 ENROLLED_PHOTOS = 3
-PROBE_PHOTOS = 2
-SHOTS = ENROLLED_PHOTOS + PROBE_PHOTOS
+SHOTS = ENROLLED_PHOTOS + 2
 _PEOPLE = {f"person-{number}": number for number in (*ENROLLED, *STRANGERS)}
 _FILES = {f"{shot}.png": shot for shot in range(SHOTS)}
 

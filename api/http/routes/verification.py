@@ -33,7 +33,6 @@ from api.http.routes.challenges import Challenge, opened_challenge
 from api.http.schemas import VerifyAnswer
 from api.service.metrics import DECISIONS, step
 from api.service.runtime import Runtime
-from templates.errors import ContractMismatch
 from templates.keys.holder_key import wipe
 from templates.store.attempts import Attempt
 from verify import (
@@ -212,11 +211,7 @@ def _probe(
 def _why_not(runtime: Runtime, tenant: str, subject: str) -> Exception:
     """Say why there is no template to decide by, to a key that may know who is enrolled."""
     record = runtime.store.subjects.describe(tenant, subject)
-    if record is None:
-        return ApiError("not_enrolled", "nobody is enrolled under this id")
-    try:
-        runtime.contract.binding.require_contract(record.contract_id, what="the stored template")
-    except ContractMismatch as error:
-        return error
-    # It was enrolled between the two looks.
-    return ApiError("not_enrolled", "nobody was enrolled under this id a moment ago; send it again")
+    if record is not None:
+        binding = runtime.contract.binding
+        binding.require_contract(record.contract_id, what="the stored template")
+    return ApiError("not_enrolled", "nobody is enrolled under this id")

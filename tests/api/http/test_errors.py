@@ -93,6 +93,8 @@ def test_every_exception_of_the_packages_has_a_code() -> None:
                 others=(0,),
                 details={},
                 code="no_face",
+                retry_after_s=1.0,
+                template_id=None,
             )
             assert api_error(instance).code != "internal_error", kind
 
