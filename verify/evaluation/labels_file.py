@@ -30,9 +30,6 @@ class Labels:
     # By the path or name of a row, and by that without suffix; an empty cell is absent.
     of: Mapping[str, Mapping[str, str]]
 
-    def __repr__(self) -> str:
-        return f"Labels({', '.join(self.attributes)})"
-
     def find(self, picture: str) -> Mapping[str, str]:
         """Labels of a picture by its name in the set; empty where no row speaks of it.
 

@@ -34,9 +34,6 @@ class VerificationSet:
     def __len__(self) -> int:
         return len(self.same)
 
-    def __repr__(self) -> str:
-        return f"VerificationSet({self.name}: {len(self)} pairs of {len(self.pictures)} photos)"
-
     @property
     def genuine(self) -> int:
         """Number of pairs that show one person."""

@@ -58,7 +58,6 @@ def document(
         "contract": contract and {"contract_id": contract.contract_id, "liveness": policy},
         "dataset": {
             "name": presented.name,
-            "kind": presented.kind,
             "subjects": presented.subjects,
             "live": len(scored.rows(None)),
             "attacks": {name: len(scored.rows(name)) for name in presented.species},

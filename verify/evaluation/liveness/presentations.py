@@ -31,7 +31,6 @@ class PresentationSet:
     """Live and attack photos."""
 
     name: str
-    kind: str  # folder or csv
     presentations: tuple[Presentation, ...]  # live ones first, then by species and name
 
     @property
@@ -66,8 +65,7 @@ def read_presentations(path: Path, *, attacks: bool) -> PresentationSet:
     if attacks and all(one.species is None for one in presentations):
         raise DatasetError(f"{path} has no attack photo, and APCER is of attack photos")
     ordered = sorted(presentations, key=lambda one: (one.species or "", one.name))
-    kind = "folder" if path.is_dir() else "csv"
-    return PresentationSet(path.resolve().stem, kind, tuple(ordered))
+    return PresentationSet(path.resolve().stem, tuple(ordered))
 
 
 def _folder(root: Path) -> list[Presentation]:

@@ -26,4 +26,4 @@ def scored_set(stated: Sequence[Stated], embeddings: np.ndarray | None = None) -
     )
     if embeddings is None:
         embeddings = np.zeros((len(stated), 4), np.float32)
-    return ScoredSet(PresentationSet("booth", "csv", presentations), scores, embeddings, failures)
+    return ScoredSet(PresentationSet("booth", presentations), scores, embeddings, failures)

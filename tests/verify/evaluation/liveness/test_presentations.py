@@ -22,7 +22,7 @@ def test_a_folder_of_live_and_spoof(tmp_path):
         *("spoof/print/x.jpg", "spoof/mask v2/y.webp", "readme.md"),
     )
     presented = read_presentations(root, attacks=True)
-    assert (presented.name, presented.kind) == ("booth", "folder")
+    assert presented.name == "booth"
     assert [(one.name, one.species) for one in presented.presentations] == [
         ("live/b.jpg", None),
         ("live/deep/a.PNG", None),
@@ -48,7 +48,7 @@ def test_a_csv(tmp_path):
     table = tmp_path / "booth.csv"
     table.write_text("Path,presentation,subject\nc.jpg,replay,ann\na.jpg,live,ann\n\nb.jpg,live,\n")
     presented = read_presentations(table, attacks=True)
-    assert (presented.name, presented.kind, presented.subjects) == ("booth", "csv", None)
+    assert (presented.name, presented.subjects) == ("booth", None)
     assert [(one.path, one.species, one.subject) for one in presented.presentations] == [
         (tmp_path / "a.jpg", None, "ann"),
         (tmp_path / "b.jpg", None, None),
