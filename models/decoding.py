@@ -66,17 +66,12 @@ def turn(pixels: int) -> Iterator[None]:
 
 
 def decode_image(data: bytes) -> NDArray[np.uint8]:
-    """Decode a JPEG, PNG, WebP or BMP picture.
+    """Decode a JPEG, PNG, WebP or BMP picture; its name and declared type do not matter.
 
     The EXIF orientation is applied. Greyscale, palette, CMYK and 16-bit pictures are converted
     to 8-bit RGB (16 bits are scaled by 255/65535, not clipped); transparency is laid over white,
     the background of identity photos. Animated pictures are refused: which frame was meant is not
     known. Pictures of together more than `MEGAPIXELS_AT_A_TIME` wait for each other.
-
-    Parameters
-    ----------
-    data
-        The encoded picture. Its name and declared type do not matter.
 
     Returns
     -------

@@ -71,7 +71,7 @@ def _png_head(data: bytes) -> Head:
         if name == b"IEND" or end >= len(data):
             return Head(b"".join(kept), orientation)
         at = end
-    raise _too_many("PNG", MAX_PNG_CHUNKS, "chunks")
+    raise ImageError("unsupported_image", f"The PNG file has more than {MAX_PNG_CHUNKS} chunks.")
 
 
 def _jpeg_head(data: bytes) -> Head:
@@ -98,7 +98,10 @@ def _jpeg_head(data: bytes) -> Head:
             is_needed = marker not in _UNREAD
         if is_needed:
             kept.append(view[start:at])
-    raise _too_many("JPEG", MAX_JPEG_SEGMENTS, "parts before its first scan")
+    raise ImageError(
+        "unsupported_image",
+        f"The JPEG file has more than {MAX_JPEG_SEGMENTS} parts before its first scan.",
+    )
 
 
 def _scans(data: bytes, at: int) -> int:
@@ -172,7 +175,3 @@ def unread_file(data: bytes) -> ImageError:
         if _PHONE_PICTURE.match(data[:512])
         else "The file is not a JPEG, PNG, WebP or BMP picture, or is damaged.",
     )
-
-
-def _too_many(name: str, most: int, parts: str) -> ImageError:
-    return ImageError("unsupported_image", f"The {name} file has more than {most} {parts}.")

@@ -15,8 +15,6 @@ from models.pack_file import PackFile, read_pack_file
 from models.sessions import Session, Tensor
 
 _SUFFIX = ".onnx"
-# A ResNet-100 embedder has 260 MB; protobuf itself ends at 2 GiB.
-_MAX_MODEL_BYTES = 2**30
 
 
 class Role(StrEnum):
@@ -85,8 +83,6 @@ def _read_graph(
     path: Path, stated: PackFile, providers: Sequence[str], threads: int | None
 ) -> PackGraph:
     try:
-        if path.stat().st_size > _MAX_MODEL_BYTES:
-            raise PackError(f"{path} is larger than {_MAX_MODEL_BYTES} bytes: not a face model.")
         model = path.read_bytes()
     except OSError as error:
         raise PackError(f"{path} cannot be read: {error.strerror}.") from error
