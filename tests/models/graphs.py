@@ -128,55 +128,32 @@ def mean_liveness(weights: np.ndarray, *, size: Dim = 80, softmax: bool = False)
 
 
 def fixed_face_detector(box: Sequence[float], keypoints: np.ndarray, *, canvas: int = 128) -> bytes:
-    """A YuNet that sees one face at one place, of every canvas that is not all black."""
-    x1, y1, x2, y2 = box
-    constants, nodes = [], []
-    for stride in (8, 16, 32):
-        cells = (canvas // stride) ** 2
-        parts = {
-            "cls": np.zeros((1, cells, 1)),
-            "seen": np.zeros((1, cells, 1)),
-            "bbox": np.zeros((1, cells, 4)),
-            "kps": np.zeros((1, cells, 10)),
-        }
-        if stride == 32:
-            # Of the first cell, whose corner is the origin.
-            parts["cls"][0, 0] = parts["seen"][0, 0] = 1
-            centre = [(x1 + x2) / 2 / stride, (y1 + y2) / 2 / stride]
-            sides = [np.log((x2 - x1) / stride), np.log((y2 - y1) / stride)]
-            parts["bbox"][0, 0] = [*centre, *sides]
-            parts["kps"][0, 0] = (keypoints / stride).ravel()
-        for name, values in parts.items():
-            made = "seen" if name == "seen" else f"{name}_made"
-            constants.append(
-                helper.make_tensor(
-                    f"{made}_{stride}", TensorProto.FLOAT, values.shape, values.ravel()
-                )
-            )
-            if name == "seen":
-                nodes.append(
-                    helper.make_node("Mul", [f"seen_{stride}", "light"], [f"obj_{stride}"])
-                )
-            else:
-                nodes.append(
-                    helper.make_node("Identity", [f"{made}_{stride}"], [f"{name}_{stride}"])
-                )
-    constants.append(helper.make_tensor("gain", TensorProto.FLOAT, [], [1.0]))
-    light = [
-        helper.make_node("ReduceMax", ["input"], ["brightest"], keepdims=0),
-        helper.make_node("Min", ["brightest", "gain"], ["light"]),
-    ]
+    """A YuNet that sees one face, always the same, in every picture that is not black."""
     widths = {"cls": 1, "obj": 1, "bbox": 4, "kps": 10}
+    values = {
+        f"{name}_{stride}": np.zeros((1, (canvas // stride) ** 2, width), np.float32)
+        for name, width in widths.items()
+        for stride in (8, 16, 32)
+    }
+    # Of the first cell, whose corner is the origin.
+    x1, y1, x2, y2 = box
+    values["cls_32"][0, 0] = values["obj_32"][0, 0] = 1
+    values["bbox_32"][0, 0, :2] = (x1 + x2) / 64, (y1 + y2) / 64
+    values["bbox_32"][0, 0, 2:] = np.log([(x2 - x1) / 32, (y2 - y1) / 32])
+    values["kps_32"][0, 0] = (keypoints / 32).ravel()
     graph = helper.make_graph(
-        [*light, *nodes],
+        [
+            helper.make_node("ReduceMax", ["input"], ["brightest"], keepdims=0),
+            helper.make_node("Min", ["brightest", "one"], ["light"]),
+            *(helper.make_node("Mul", [f"made_{name}", "light"], [name]) for name in values),
+        ],
         "fixed-face",
         [_value("input", [1, 3, canvas, canvas])],
+        [_value(name, made.shape) for name, made in values.items()],
         [
-            _value(f"{name}_{stride}", [1, (canvas // stride) ** 2, width])
-            for name, width in widths.items()
-            for stride in (8, 16, 32)
+            helper.make_tensor("one", TensorProto.FLOAT, [], [1.0]),
+            *(numpy_helper.from_array(made, f"made_{name}") for name, made in values.items()),
         ],
-        constants,
     )
     return _save(graph)
 
