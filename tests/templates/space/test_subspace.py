@@ -10,7 +10,7 @@ from scipy import stats
 from templates.errors import InvalidTemplate, LiftingError
 from templates.keys.randomness import Keystream
 from templates.space import subspace
-from templates.space.subspace import SubspaceBatch, span_basis
+from templates.space.subspace import SubspaceBatch
 
 
 def units(stream: Keystream, count: int, n: int) -> np.ndarray:
@@ -124,18 +124,6 @@ def test_memory_is_bounded_by_the_tile(monkeypatch: pytest.MonkeyPatch):
     assert result < peak < result + (8 << 20)
 
 
-@pytest.mark.parametrize("condition", [1.0, 1e2, 1e4])
-def test_bases_of_ill_conditioned_directions_are_orthonormal(condition: float):
-    n, m = 60, 59
-    stream = Keystream.seeded("condition")
-    left = scipy.linalg.qr(stream.normal((m, m)))[0]
-    right = scipy.linalg.qr(stream.normal((n, n)))[0][:m]
-    directions = left @ (np.geomspace(1, 1 / condition, m)[:, None] * right)
-    rows = span_basis(directions[None])[0]
-    np.testing.assert_allclose(rows @ rows.T, np.eye(m), atol=1e-9)
-    np.testing.assert_allclose(rows.T @ rows, right.T @ right, atol=1e-9 * condition)
-
-
 def test_degenerate_requests_are_refused():
     stream = Keystream.seeded("bad")
     point, directions = units(stream, 1, 8)[0], stream.normal((3, 8))
@@ -154,23 +142,6 @@ def test_degenerate_requests_are_refused():
     ):
         with pytest.raises(LiftingError, match=reason):
             SubspaceBatch.through(point, bad, stream=stream)
-
-
-def test_validation_names_each_fault():
-    good = through_all(units(Keystream.seeded("v"), 4, 10), 0, stream=Keystream.seeded(1))
-    good.validate()
-    foot, basis = good.foot, good.basis
-    nan = basis.copy()
-    nan[1, 1] = np.nan
-    for bad, reason in (
-        (SubspaceBatch(foot, nan), "not finite"),
-        (SubspaceBatch(foot, basis * 1.001), "not orthonormal"),
-        (SubspaceBatch(foot, basis[[0, 0, 1]]), "not orthonormal"),
-        (SubspaceBatch(foot + 1e-3 * basis[0], basis), "not orthogonal"),
-        (SubspaceBatch(foot * (1.01 / good.foot_norm), basis), "outside the unit ball"),
-    ):
-        with pytest.raises(InvalidTemplate, match=reason):
-            bad.validate()
 
 
 def test_shapes_are_checked_by_the_constructors():
@@ -203,10 +174,4 @@ def test_batch_indexes_like_a_list_of_templates():
     with pytest.raises(ValueError, match="too many values"):
         _ = batch.foot
     assert not batch.bases.flags.writeable
-
-
-def test_numbers_do_not_show():
-    stream = Keystream.seeded("show")
-    batch = SubspaceBatch.through(units(stream, 2, 9), stream.normal((2, 3, 9)), stream=stream)
-    assert repr(batch) == "SubspaceBatch(2 of n=9, m=3)"
-    assert repr(batch[0]) == "SubspaceBatch(1 of n=9, m=3)"
+    assert repr(batch) == "SubspaceBatch(5 of n=9, m=2)"
