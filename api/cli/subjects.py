@@ -93,7 +93,7 @@ class _Entrance:
         epoch = self.runtime.current_epoch(self.tenant)
         with naming_photo(photos):
             enrollment = epoch.enroller.from_photos(self.pack, data, policy=face)
-        stored = self.runtime.put(
+        replaced = self.runtime.put(
             self.tenant,
             subject,
             epoch,
@@ -104,9 +104,9 @@ class _Entrance:
         )
         return {
             "subject_id": subject,
-            "template_id": stored.template_id,
+            "template_id": enrollment.template_id,
             "contract_id": enrollment.contract_id,
-            "replaced": not stored.created,
+            "replaced": replaced,
             "photos": len(photos),
         }
 

@@ -28,7 +28,7 @@ from templates.keys.rotation import TenantRotation
 from templates.store.audit_log import By
 from templates.store.schema import Source
 from templates.store.secrets import SecretName
-from templates.store.subjects import Precondition, StoredTemplate, SubjectTemplate
+from templates.store.subjects import Precondition, SubjectTemplate
 from verify import Verifier
 
 TENANTS_KEPT = 64
@@ -136,8 +136,8 @@ class Runtime(Deployment):
         token: str | None = None,
         action: Literal["enroll", "import"] = "enroll",
         by: By,
-    ) -> StoredTemplate:
-        """Store an enrollment in place of an earlier one.
+    ) -> bool:
+        """Store an enrollment; returns whether it replaced an earlier one.
 
         `precondition`, `token` and `action` are those of ``Subjects.put``.
         """

@@ -17,7 +17,6 @@ from templates.store.repository import TemplateStore
 from templates.store.retention import Retention
 from templates.store.rewrap import count_wrapped, rewrap_keys
 from templates.store.schema import Source
-from templates.store.subjects import StoredTemplate
 from templates.store.tenants import RetiredRotation
 
 __all__ = [
@@ -39,7 +38,6 @@ __all__ = [
     "RetiredRotation",
     "Right",
     "Source",
-    "StoredTemplate",
     "TemplateStore",
     "UnknownTenant",
     "archive_audit_log",

@@ -91,8 +91,6 @@ class Attempts:
 
         Parameters
         ----------
-        tenant, subject_id
-            Whom the probe is compared with.
         compare
             Makes the decision; called again where the template was replaced meanwhile, the last
             time inside the write, so it must not write itself. It may raise
@@ -102,8 +100,6 @@ class Attempts:
             A template of another contract is treated as absent, and costs the same.
         token
             Digest of the one-use token or challenge that the decision uses up.
-        by
-            Who asks.
 
         Raises
         ------

@@ -111,29 +111,26 @@ class Database:
             yield session
 
     @contextlib.contextmanager
-    def write(self, *, wait: float | None = None) -> Iterator[Session]:
+    def write(self, *, timeout: float | None = None) -> Iterator[Session]:
         """Give a session in one transaction, while no other write runs, and commit it.
 
-        Keep the block short. `wait` is how many seconds to wait for other writes, the timeout by
-        default, and 0 for as long as it takes (on SQLite, and for the threads of this process, the
-        timeout). After :class:`StoreBusy`, as after any error, nothing was written.
+        Keep the block short. `timeout` is another one for other writes on PostgreSQL; 0 waits as
+        long as it takes. After :class:`StoreBusy`, as after any error, nothing was written.
         """
-        wait = self._timeout if wait is None else wait
-        patience = wait or self._timeout
-        until = time.monotonic() + patience
-        # Threads queue here in turn: SQLite's own lock is polled and knows no order, and on
-        # PostgreSQL each that waits would hold a connection that readers need.
-        turn = self._turn_of_threads(patience)
+        until = time.monotonic() + self._timeout
         # Rows stay readable after the commit.
         session = Session(self.engine, expire_on_commit=False)
-        with _translating(), turn, session, session.begin():
+        # Threads queue here in turn: SQLite's own lock is polled and knows no order, and on
+        # PostgreSQL each that waits would hold a connection that readers need.
+        with _translating(), self._turn_of_threads(), session, session.begin():
             if self.is_sqlite:
                 connection = session.connection()
                 with self._turn(until), self._patience(connection, until) as driver:
                     driver.execute("BEGIN IMMEDIATE")
                 self._require_file()
             else:
-                session.execute(_BEGIN_WRITE, {"limit": str(round(1000 * wait))})
+                limit = self._timeout if timeout is None else timeout
+                session.execute(_BEGIN_WRITE, {"limit": str(round(1000 * limit))})
             yield session
 
     def purge_log(self) -> bool:
@@ -147,7 +144,7 @@ class Database:
             return True
         with (
             contextlib.suppress(*_DATABASE_ERRORS, StoreError),
-            self._turn_of_threads(self._timeout),
+            self._turn_of_threads(),
             self._turn(time.monotonic() + PURGE_WAIT_S),
             self.engine.connect() as connection,
             self._patience(connection, time.monotonic() + PURGE_WAIT_S) as driver,
@@ -166,7 +163,7 @@ class Database:
         autocommit = self.engine.execution_options(isolation_level="AUTOCOMMIT")
         with (
             _translating(),
-            self._turn_of_threads(self._timeout),
+            self._turn_of_threads(),
             self._turn(time.monotonic() + self._timeout),
             autocommit.connect() as connection,
         ):
@@ -181,9 +178,9 @@ class Database:
         self.engine.dispose()
 
     @contextlib.contextmanager
-    def _turn_of_threads(self, timeout: float) -> Iterator[None]:
+    def _turn_of_threads(self) -> Iterator[None]:
         """Hold the turn among the threads of this process; StoreBusy where it does not come."""
-        if not self._writing.acquire(timeout=timeout):
+        if not self._writing.acquire(timeout=self._timeout):
             raise StoreBusy("other writes of this process take too long")
         try:
             yield

@@ -63,6 +63,7 @@ class LockedOut(StoreError):
     `recorded` is whether the audit log has a line of it.
     """
 
+    retry_after_s: float | None = None
     recorded = False
 
     def __init__(self, retry_after_s: float | None) -> None:

@@ -20,7 +20,7 @@ def upgrade(database: Database) -> None:
     StoreError
         If the schema is one that this program does not know. Nothing was changed.
     """
-    with database.write(wait=0) as session:
+    with database.write(timeout=0) as session:
         present = _revision_of(session)
         _require_known(present)
         if present != head_revision():

@@ -31,6 +31,8 @@ _CURSOR_PURPOSE = "list-cursor"
 class EnrollmentConflict(StoreError):
     """The subject has another template than a write may replace, `template_id`, or has none."""
 
+    template_id: str | None = None
+
     def __init__(self, template_id: str | None) -> None:
         super().__init__(
             "the subject has another template than the request may replace, or has none: name the "
@@ -65,14 +67,6 @@ class SubjectTemplate:
 
 
 @dataclass(frozen=True)
-class StoredTemplate:
-    """What :meth:`Subjects.put` did."""
-
-    template_id: str
-    created: bool
-
-
-@dataclass(frozen=True)
 class SubjectPage:
     """One page of subjects; `next_cursor` is None on the last one."""
 
@@ -102,13 +96,11 @@ class Subjects:
         action: Literal["enroll", "import"] = "enroll",
         token: str | None = None,
         by: By = PROGRAM,
-    ) -> StoredTemplate:
-        """Store a template, or replace the one there is, in one transaction.
+    ) -> bool:
+        """Store a template in one transaction; returns whether it replaced another one.
 
         Parameters
         ----------
-        wire
-            The template's wire bytes.
         contract_id, source, photos
             Metadata that stays readable without a key.
         template_id
@@ -129,8 +121,8 @@ class Subjects:
 
         Notes
         -----
-        A replacement gets a fresh data key, and the old key and ciphertext are removed with it:
-        an old backup of one of the two rows does not help to read the other.
+        A replacement gets a fresh data key, and the old key and ciphertext go: the old key, out of
+        a backup, does not help to read the new template.
         """
         subject_id = checked_subject_id(subject_id)
         context = self._context
@@ -145,7 +137,7 @@ class Subjects:
                 raise EnrollmentConflict(enrolled)
             if token is not None and is_used(session, token):
                 raise Replayed
-            created = subject is None
+            replaces = subject is not None
             if subject is None:
                 subject = SubjectRow(id=uuid.uuid4().hex, tenant_id=owner.id, created_at=now)
                 subject.subject_id = subject_id
@@ -158,13 +150,13 @@ class Subjects:
             subject.updated_at = now
             # Sealed here: a rotation of the master key that ends later finds it.
             seal_template(subject, wire, context.keyring)
-            outcome = "created" if created else "replaced"
+            outcome = "replaced" if replaces else "created"
             detail = template_digest(template_id)
             entry = Entry(action, outcome, by, tenant, pseudonym, detail, token)
             context.audit_log.append(session, entry)
-        if not created:
+        if replaces:
             context.database.purge_log()
-        return StoredTemplate(template_id, created)
+        return replaces
 
     def record_export(self, tenant: str, subject_id: str, *, template_id: str, by: By) -> None:
         """Write the line of an export; :class:`StoreBusy` if it is no longer the subject's."""

@@ -9,7 +9,7 @@ had come one after the other.
 import math
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -23,7 +23,6 @@ from templates.store import TemplateStore, verify_audit_log
 from templates.store.audit_log import Line
 from templates.store.receipts import Receipt, verify_receipt
 from templates.store.schema import ReceiptRow
-from tests.api.deployment import Deployment
 from tests.databases import execute
 from tests.reliability.operations import Operation
 
@@ -54,7 +53,10 @@ class Report:
         """
         examined = examine(asked, subjects)
         self.violations += [*unexpected(asked.history, allowed), *examined.violations]
-        self.figures |= {"of_these_effective": examined.effective, "audit_lines": examined.lines}
+        self.figures |= {
+            "of_these_effective": examined.effective,
+            "audit_lines": len(examined.lines),
+        }
         counted = {"enroll": "enrollments", "erase": "erasures", "verify": "decisions"}
         for each in asked.history:
             self.add("answers_503", each.outcome == 503)
@@ -80,46 +82,27 @@ class Asked(Protocol):
     def replays(self) -> list[tuple[Operation, Operation]]: ...
 
 
-@dataclass(frozen=True)
-class Examined:
-    """What was found.
-
-    Attributes
-    ----------
-    violations
-        One sentence for each thing that is wrong.
-    effective
-        Writes without a good answer that took effect nevertheless, by the audit log.
-    lines
-        Lines of the audit log.
-    """
-
-    violations: list[str]
-    effective: int
-    lines: int
-
-
-def examine(asked: Asked, subjects: Sequence[str]) -> Examined:
+def examine(asked: Asked, subjects: Sequence[str]) -> "Examination":
     """Compare history, audit log and tables; the service must not run any more."""
-    deployment: Deployment = asked.service.deployment
-    store = open_store(deployment.settings, open_keyring(deployment.settings))
+    settings = asked.service.deployment.settings
+    store = open_store(settings, open_keyring(settings))
     try:
-        return _Examination(deployment, store, asked, subjects).run()
+        examination = Examination(store, asked)
+        examination.run(subjects)
+        return examination
     finally:
         store.close()
 
 
-class _Examination:
-    def __init__(
-        self,
-        deployment: Deployment,
-        store: TemplateStore,
-        asked: Asked,
-        subjects: Sequence[str],
-    ) -> None:
+class Examination:
+    """What was found: `violations`, one sentence each, and the `lines` of the audit log.
+
+    `effective` counts the writes without a good answer that took effect nevertheless, by the log.
+    """
+
+    def __init__(self, store: TemplateStore, asked: Asked) -> None:
         self.tenant = DEFAULT_TENANT
         self.store = store
-        self.subjects = subjects
         self.history = [each for each in asked.history if each.kind != "contract"]
         self.replays = asked.replays
         self.violations: list[str] = []
@@ -129,26 +112,22 @@ class _Examination:
         for line in self.lines:
             if line.request_id is not None:
                 self.by_request[line.request_id].append(line)
-
-    def run(self) -> Examined:
-        for check in (
-            self._chain,
-            self._answers_have_their_lines,
-            self._lines_have_their_requests,
-            self._lines_follow_the_clock,
-            self._tables_are_whole,
-            self._receipts,
-            self._tokens,
-            self._repeated_probes,
-        ):
-            check()
-        for subject in self.subjects:
-            self._subject(subject)
-            self._counted(subject)
-            self._serial(subject)
         unsure = [each for each in self.history if each.writes and each.may_have_happened]
-        effective = sum(1 for each in unsure if self.by_request[each.request_id])
-        return Examined(self.violations, effective, len(self.lines))
+        self.effective = sum(1 for each in unsure if each.request_id in self.by_request)
+
+    def run(self, subjects: Sequence[str]) -> None:
+        """Look for violations."""
+        self._chain()
+        self._answers_have_their_lines()
+        self._lines_have_their_requests()
+        self._lines_follow_the_clock()
+        self._tables_are_whole()
+        self._receipts()
+        self._tokens()
+        self._repeated_probes()
+        for subject in subjects:
+            self._subject(subject)
+            self._serial(subject)
 
     def _wrong(self, what: str) -> None:
         self.violations.append(what)
@@ -261,22 +240,6 @@ class _Examination:
                     self._wrong(f"audit log: line {line.sequence} says {line.outcome}")
                 enrolled, erased = False, True
 
-    def _counted(self, subject: str) -> None:
-        """The failed attempts are those of the audit log."""
-        counted: int | None = None
-        for line in self._lines_of(subject):
-            match line.action, line.outcome:
-                case "erase", _:
-                    counted = None
-                case "verify", "reject":
-                    counted = (counted or 0) + 1
-                case "verify", "accept":
-                    counted = None if counted is None else 0
-        status = self.store.attempts.status(self.tenant, subject)
-        counts = None if status is None else status.consecutive
-        if counts != counted:
-            self._wrong(f"{subject}: failed attempts are {counts}, by the audit log {counted}")
-
     def _serial(self, subject: str) -> None:
         """In the log's order, each answer on a subject is what the calls before it had left.
 
@@ -318,21 +281,13 @@ class _Examination:
     def _writes_of(self, subject: str) -> list[Operation]:
         return [each for each in self._operations(self._lines_of(subject)) if each.writes]
 
-    def _noting(self, what: str) -> Any:
-        return _Noting(self._wrong, what)
-
-
-class _Noting(suppress):
-    """Turns an error of ours into a violation."""
-
-    def __init__(self, note: Callable[[str], None], what: str) -> None:
-        super().__init__(VeilfaceError)
-        self._note, self._what = note, what
-
-    def __exit__(self, kind: Any, value: Any, trace: Any) -> bool:
-        if isinstance(value, VeilfaceError):
-            self._note(f"{self._what}: {value}")
-        return bool(super().__exit__(kind, value, trace))
+    @contextmanager
+    def _noting(self, what: str) -> Iterator[None]:
+        """Turn an error of ours into a violation."""
+        try:
+            yield
+        except VeilfaceError as error:
+            self._wrong(f"{what}: {error}")
 
 
 def _line_of(each: Operation, lines: Sequence[Line]) -> tuple[str, str]:

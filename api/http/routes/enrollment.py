@@ -82,7 +82,7 @@ async def enroll(
                     )
             finally:
                 wipe(key)
-            stored = runtime.put(
+            replaced = runtime.put(
                 tenant,
                 subject,
                 epoch,
@@ -94,9 +94,9 @@ async def enroll(
                 by=call.by,
             )
             return EnrollmentAnswer(
-                template_id=stored.template_id,
+                template_id=enrollment.template_id,
                 contract_id=enrollment.contract_id,
-                replaced=not stored.created,
+                replaced=replaced,
                 holder_key=enrollment.holder_salt is not None,
                 images=[
                     Photo(index=index, status="used", quality=asdict(quality))

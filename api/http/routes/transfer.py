@@ -79,7 +79,7 @@ async def import_subject(
             else:
                 enrollment = epoch.enroller.from_template(exported.wire)
 
-            stored = runtime.put(
+            replaced = runtime.put(
                 call.tenant,
                 exported.subject_id,
                 epoch,
@@ -92,9 +92,9 @@ async def import_subject(
             )
             return ImportAnswer(
                 subject_id=exported.subject_id,
-                template_id=stored.template_id,
+                template_id=enrollment.template_id,
                 contract_id=enrollment.contract_id,
-                replaced=not stored.created,
+                replaced=replaced,
                 holder_key=salt is not None,
             )
 

@@ -54,7 +54,7 @@ def show(word: str, *, settings: Settings) -> None:
 @app.command()
 @reports()
 def tell() -> Result:
-    keys = [{"prefix": "ab", "rights": ["verify"], "last_used_at": None}]
+    keys = [{"prefix": "ab", "rights": ["verify"], "expires_at": None}]
     return Result({"is_valid": True, "share": 1 / 3, "claims": {"tenant": "acme"}, "keys": keys})
 
 

@@ -11,7 +11,7 @@ import pytest
 import sqlalchemy as sa
 
 from templates.keys.sealing import MasterKeyring
-from templates.store import Source, StoredTemplate, TemplateStore
+from templates.store import Source, TemplateStore
 from templates.store.envelope import seal_template
 from templates.store.schema import Base
 from tests.databases import (  # noqa: F401
@@ -116,8 +116,8 @@ def put(
     *,
     tenant: str = "default",
     **changes: Any,
-) -> StoredTemplate:
-    """Store a template with ordinary metadata."""
+) -> bool:
+    """Store a template with ordinary metadata; whether it replaced another one."""
     return store.subjects.put(
         tenant,
         subject_id,

@@ -1,8 +1,8 @@
 """Decisions: what they read, how failures are counted, locks, one-use tokens, and races."""
 
-import os
 import threading
 from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import timedelta
 from typing import Any, TextIO
@@ -29,7 +29,7 @@ from templates.store.audit_log import token_digest
 from templates.store.schema import SubjectRow
 from tests.databases import execute
 from tests.templates.store.conftest import CONTRACT, Clock, put, template_id
-from tests.templates.store.test_concurrency import fork
+from tests.templates.store.test_concurrency import in_processes
 
 BY = By("key:00112233aabb", "request-12345678")
 TOKEN = token_digest("00112233aabb", "random id")
@@ -411,32 +411,24 @@ def test_a_token_that_is_used_meanwhile_is_replayed_with_a_line(ada: TemplateSto
 
 def in_threads(store: TemplateStore, attempts: list[dict[str, Any]]) -> Counter[str]:
     """Answers of attempts that are all compared before the first of them is recorded."""
-    answers: list[str] = []
-    errors: list[BaseException] = []
     compared = threading.Barrier(len(attempts))
 
-    def one(arguments: dict[str, Any]) -> None:
-        accepted = arguments.pop("accepted", False)
+    def one(arguments: dict[str, Any]) -> str:
+        accepted = arguments.get("accepted", False)
 
         def compare(_: Attempt) -> Says:
             compared.wait()
             return Says(accepted)
 
+        options = {name: arguments[name] for name in arguments if name != "accepted"}
         try:
-            decide(store, compare, **arguments)
-            answers.append("accept" if accepted else "reject")
+            decide(store, compare, **options)
         except (LockedOut, Replayed) as error:
-            answers.append("locked" if isinstance(error, LockedOut) else "replayed")
-        except BaseException as error:
-            errors.append(error)
+            return "locked" if isinstance(error, LockedOut) else "replayed"
+        return "accept" if accepted else "reject"
 
-    threads = [threading.Thread(target=one, args=(dict(each),)) for each in attempts]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert errors == []
-    return Counter(answers)
+    with ThreadPoolExecutor(len(attempts)) as threads:
+        return Counter(threads.map(one, attempts))
 
 
 @pytest.mark.parametrize("subject", ["ada", "nobody"])
@@ -459,10 +451,5 @@ def test_processes_count_together(ada: TemplateStore) -> None:
         for _ in range(6):
             print(attempt(ada).split()[0], file=output)
 
-    children = [fork(work, ada) for _ in range(4)]
-    answers: Counter[str] = Counter()
-    for child, output in children:
-        with output:
-            answers.update(output.read().split())
-        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    answers = Counter(" ".join(in_processes(work, ada, 4)).split())
     assert answers == {"reject": 5, "locked": 19}

@@ -4,7 +4,6 @@ import contextlib
 import hashlib
 import hmac
 import json
-import os
 from collections.abc import Callable, Iterator
 from itertools import chain
 from pathlib import Path
@@ -35,7 +34,7 @@ from templates.store.schema import AuditRow, SubjectRow
 from templates.store.secrets import SecretName
 from tests.databases import execute
 from tests.templates.store.conftest import Clock, put
-from tests.templates.store.test_concurrency import fork
+from tests.templates.store.test_concurrency import in_processes
 
 LINES = 8
 TOKEN = token_digest("00112233aabb", "random id")
@@ -177,8 +176,8 @@ def test_a_rolled_back_write_leaves_no_line(store: TemplateStore) -> None:
 
 def test_every_write_has_its_line(store: TemplateStore) -> None:
     by = By("operator:root", "request-12345678")
-    one = put(store, "ada", b"one", by=by)
-    two = put(store, "ada", b"two", by=by, token=TOKEN)
+    put(store, "ada", b"one", by=by, template_id="one")
+    put(store, "ada", b"two", by=by, token=TOKEN, template_id="two")
     store.erasures.erase("default", "ada", by=by)
     store.erasures.erase("default", "ada", by=by)
     store.erasures.erase("default", "eve", by=by)
@@ -192,8 +191,8 @@ def test_every_write_has_its_line(store: TemplateStore) -> None:
         (line.action, line.outcome, line.tenant, line.pseudonym, line.detail, line.token)
         for line in lines
     ] == [
-        ("enroll", "created", "default", ada, template_digest(one.template_id), None),
-        ("enroll", "replaced", "default", ada, template_digest(two.template_id), TOKEN),
+        ("enroll", "created", "default", ada, template_digest("one"), None),
+        ("enroll", "replaced", "default", ada, template_digest("two"), TOKEN),
         ("erase", "erased", "default", ada, None, None),
         ("erase", "receipt_repeated", "default", ada, None, None),
         ("erase", "nothing_held", "default", eve, None, None),
@@ -450,10 +449,6 @@ def test_processes_append_to_one_chain(store: TemplateStore) -> None:
             store.audit_log.record(entry(number))
         print("done", file=output)
 
-    children = [fork(work, store) for _ in range(4)]
-    for child, output in children:
-        with output:
-            assert output.read() == "done\n"
-        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    assert list(in_processes(work, store, 4)) == ["done\n"] * 4
     assert [line.sequence for line in store.audit_log.lines()] == list(range(1, 101))
     assert verify_audit_log(store).intact

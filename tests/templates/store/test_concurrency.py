@@ -8,7 +8,7 @@ import signal
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TextIO
 
@@ -49,7 +49,7 @@ def mix(store: TemplateStore, seed: int, steps: int) -> Counter[str]:
         subject = generator.choice(SUBJECTS)
         match generator.randrange(4):
             case 0 | 1:
-                if put(store, subject, wire_of(seed * 10_000 + step)).created:
+                if not put(store, subject, wire_of(seed * 10_000 + step)):
                     done[f"created {subject}"] += 1
             case 2:
                 if (found := store.subjects.get("default", subject)) is not None:
@@ -91,6 +91,15 @@ def fork(work: Callable[[TextIO], None], *stores: TemplateStore) -> tuple[int, T
     return child, os.fdopen(reading)
 
 
+def in_processes(work: Callable[[TextIO], None], store: TemplateStore, count: int) -> Iterator[str]:
+    """What so many processes write that do the same at the same time."""
+    children = [fork(work, store) for _ in range(count)]
+    for child, output in children:
+        with output:
+            yield output.read()
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+
+
 def assert_equal_to_a_serial_order(store: TemplateStore, done: Counter[str]) -> None:
     """In any serial order, creations and erasures of a subject alternate."""
     for subject in SUBJECTS:
@@ -106,15 +115,12 @@ def assert_equal_to_a_serial_order(store: TemplateStore, done: Counter[str]) -> 
 
 
 def test_processes_on_the_same_subjects(store: TemplateStore) -> None:
-    def work(seed: int) -> Callable[[TextIO], None]:
-        return lambda output: json.dump(mix(store, seed, 60), output)
+    def work(output: TextIO) -> None:
+        json.dump(mix(store, os.getpid(), 60), output)
 
-    workers = [fork(work(seed), store) for seed in range(10, 14)]
     done: Counter[str] = Counter()
-    for child, output in workers:
-        with output:
-            done.update(json.load(output))
-        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    for output in in_processes(work, store, 4):
+        done.update(json.loads(output))
     assert done["read"] > 0
     assert_equal_to_a_serial_order(store, done)
 

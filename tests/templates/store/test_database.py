@@ -62,16 +62,6 @@ def test_sqlite_is_private_durable_and_forgets(tmp_path: Path) -> None:
     database.close()
 
 
-def test_a_failed_write_leaves_nothing(store: TemplateStore, database_url: str) -> None:
-    database = Database(database_url)
-
-    with contextlib.suppress(RuntimeError), database.write() as session:
-        session.execute(sa.delete(TenantRow))
-        raise RuntimeError
-    assert [tenant.name for tenant in store.tenants.all()] == ["default", "other"]
-    database.close()
-
-
 def test_errors_never_quote_a_row(store: TemplateStore, database_url: str) -> None:
     database = Database(database_url)
     tenant = store.tenants.get("default")

@@ -99,6 +99,9 @@ def test_an_altered_or_foreign_receipt_is_refused(store: TemplateStore, tmp_path
         verify_receipt(receipt, foreign.signer.public_key())
     with pytest.raises(StoreError, match="32 bytes"):
         verify_receipt(receipt, b"short")
+    names = [("default", "ada"), ("default", "eve"), ("a", "bc"), ("ab", "c")]
+    pseudonyms = {each.signer.pseudonym(*name) for each in (store, foreign) for name in names}
+    assert len(pseudonyms) == 2 * len(names)  # keyed, and unambiguous
     foreign.close()
 
 
@@ -117,17 +120,6 @@ def test_an_altered_or_foreign_receipt_is_refused(store: TemplateStore, tmp_path
 def test_what_is_no_receipt_is_refused(value: object) -> None:
     with pytest.raises(StoreError):
         Receipt.from_json(value)
-
-
-def test_pseudonyms_are_keyed_and_unambiguous(store: TemplateStore, tmp_path: Path) -> None:
-    assert store.signer.pseudonym("a", "bc") != store.signer.pseudonym("ab", "c")
-    assert store.signer.pseudonym("default", "ada") == store.signer.pseudonym("default", "ada")
-    foreign = TemplateStore(
-        f"sqlite:///{tmp_path / 'foreign.db'}", MasterKeyring.create(tmp_path / "foreign.key")
-    )
-    foreign.upgrade()
-    assert foreign.signer.pseudonym("default", "ada") != store.signer.pseudonym("default", "ada")
-    foreign.close()
 
 
 GONE = "subject-0007"

@@ -11,13 +11,11 @@ from templates.store import (
     By,
     TemplateStore,
     renew_secrets,
-    verify_archive,
-    verify_audit_log,
     verify_receipt,
 )
 from templates.store.secrets import SecretName
 from tests.databases import execute
-from tests.templates.store.conftest import Clock, put
+from tests.templates.store.conftest import put
 
 
 def renew(store: TemplateStore, tmp_path: Path) -> Path:
@@ -42,38 +40,6 @@ def test_every_secret_but_those_that_stay_is_drawn_anew(
     fresh = TemplateStore(database_url, keyring)
     assert secrets_of(fresh) == after
     fresh.close()
-
-
-def test_the_old_log_goes_into_an_archive_under_the_old_key(
-    store: TemplateStore, tmp_path: Path
-) -> None:
-    put(store, "ada", b"wire")
-    head, old_key = store.audit_log.head(), store.signer.public_key()
-    archive = renew(store, tmp_path)
-    assert verify_archive(archive, old_key).last == head
-    with pytest.raises(StoreError):
-        verify_archive(archive, store.signer.public_key())
-    assert [line.action for line in store.audit_log.lines()] == ["secrets-renew"]
-    assert verify_audit_log(store, anchor=head).intact
-
-
-def test_who_has_the_old_secrets_writes_no_line_and_makes_no_key(
-    store: TemplateStore,
-    database_url: str,
-    keyring: MasterKeyring,
-    tmp_path: Path,
-    clock: Clock,
-) -> None:
-    thief = TemplateStore(database_url, keyring, clock=clock)
-    secrets_of(thief)
-    made = store.api_keys.create("default", ["verify"])
-    renew(store, tmp_path)
-    with pytest.raises(BrokenAuditLog):
-        put(thief, "ada", b"wire")
-    with pytest.raises(BrokenAuditLog):
-        thief.api_keys.create("default", ["admin"])
-    assert store.api_keys.verify(made.token) is not None
-    thief.close()
 
 
 def test_a_key_that_was_made_up_before_is_not_vouched_for(

@@ -18,13 +18,13 @@ from templates.keys.randomness import Keystream
 from templates.keys.rotation import ROTATION_VERSION, Rotation, TenantRotation
 from templates.keys.sealing import MasterKeyring
 from templates.space.lifting import Strategy, lift
-from templates.store import Attempt, Source, TemplateStore, UnknownTenant, verify_audit_log
+from templates.store import Attempt, TemplateStore, UnknownTenant, verify_audit_log
 from templates.store.audit_log import By
 from templates.store.schema import RotationKeyRow, SubjectRow
 from templates.store.tenants import RetiredRotation
 from tests.databases import execute
 from tests.patience import PATIENCE_S
-from tests.templates.store.conftest import Clock, SlowSealing, found, pieces, wire_of
+from tests.templates.store.conftest import Clock, SlowSealing, found, pieces, put, wire_of
 from tests.templates.store.test_attempts import Says, decide
 
 N, M = 48, 4
@@ -48,11 +48,12 @@ class People:
         self.binding = binding(m)
 
     def enroll(
-        self, name: str, *, tenant: str = "default", dtype: wire.WireDtype = "float16"
+        self, *names: str, tenant: str = "default", dtype: wire.WireDtype = "float16"
     ) -> None:
-        epoch, new_id = self._store.tenants.get(tenant).rotation_epoch, uuid.uuid4().hex
-        encoded = self.encoded(name, epoch, new_id, tenant, dtype)
-        self.put(name, encoded, epoch, new_id, tenant)
+        epoch = self._store.tenants.get(tenant).rotation_epoch
+        for name in names:
+            new_id = uuid.uuid4().hex
+            self.put(name, self.encoded(name, epoch, new_id, tenant, dtype), epoch, new_id, tenant)
 
     def encoded(
         self,
@@ -62,29 +63,16 @@ class People:
         tenant: str = "default",
         dtype: wire.WireDtype = "float16",
     ) -> bytes:
-        turned = self.templates[self.names.index(name)].turned_by(
-            self.rotation(epoch, template_id, tenant).turned
-        )
+        rotation = self.rotation(epoch, template_id, tenant)
+        turned = self.templates[self.names.index(name)].turned_by(rotation.turned)
         return wire.encode(turned, contract_id=self.binding.contract_id, dtype=dtype)
 
     def put(
-        self,
-        name: str,
-        encoded: bytes,
-        epoch: int,
-        template_id: str,
-        tenant: str = "default",
+        self, name: str, encoded: bytes, epoch: int, template_id: str, tenant: str = "default"
     ) -> None:
-        self._store.subjects.put(
-            tenant,
-            name,
-            encoded,
-            contract_id=self.binding.contract_id,
-            template_id=template_id,
-            source=Source.PHOTOS,
-            photos=3,
-            rotation_epoch=epoch,
-        )
+        contract_id = self.binding.contract_id
+        options = {"template_id": template_id, "rotation_epoch": epoch, "tenant": tenant}
+        put(self._store, name, encoded, contract_id=contract_id, **options)
 
     def rotation(self, epoch: int, template_id: str, tenant: str = "default") -> Rotation:
         key = self._store.tenants.rotation_key(tenant, epoch)
@@ -147,8 +135,7 @@ def test_moved_templates_are_the_same_sets_in_the_new_rotation(
     store: TemplateStore, clock: Clock, dtype: wire.WireDtype
 ) -> None:
     people = People(store, 7)
-    for name in people.names:
-        people.enroll(name, dtype=dtype)
+    people.enroll(*people.names, dtype=dtype)
     people.enroll("s003", tenant="other")
     theirs = wire_of(store, "s003", tenant="other")
     before = rows(store)
@@ -193,8 +180,7 @@ def test_an_enrollment_of_an_older_epoch_is_refused(store: TemplateStore) -> Non
 
 def test_retiring_drops_the_old_keys_once_nothing_needs_them(store: TemplateStore) -> None:
     people = People(store, 4)
-    for name in people.names[:3]:
-        people.enroll(name)
+    people.enroll(*people.names[:3])
     store.rerotation.begin("default")
     store.rerotation.begin("default")
     people.enroll("s003")
@@ -215,8 +201,7 @@ def test_retiring_drops_the_old_keys_once_nothing_needs_them(store: TemplateStor
 def test_a_move_has_its_line_and_takes_back_no_decision(store: TemplateStore) -> None:
     """The template keeps its id: a probe that was compared with it before was compared with it."""
     people = People(store, 3)
-    for name in people.names:
-        people.enroll(name)
+    people.enroll(*people.names)
     store.rerotation.begin("default")
     assert store.rerotation.move("default", binding(), by=OPERATOR) == 3
     assert audit(store)[-1] == ("moved", "default", "operator:kim", "request-1", "epoch 2")
@@ -281,8 +266,7 @@ def test_ten_kills_on_the_way_lose_nothing(
     store: TemplateStore, database_url: str, key_file: Path
 ) -> None:
     people = People(store, 11)
-    for name in people.names:
-        people.enroll(name)
+    people.enroll(*people.names)
     store.rerotation.begin("default")
     for number in range(10):
         # Inside a transaction, and after it.
@@ -300,8 +284,7 @@ def test_ten_kills_on_the_way_lose_nothing(
 
 def test_a_template_that_does_not_open_is_said_and_the_rest_is_moved(store: TemplateStore) -> None:
     people = People(store, 5)
-    for name in people.names:
-        people.enroll(name)
+    people.enroll(*people.names)
     people.put("s003", b"no template", 1, "broken")
     execute(store.database, "UPDATE subjects SET template_id = 'x' WHERE subject_id = 's001'")
     store.rerotation.begin("default")
@@ -358,8 +341,7 @@ def test_sqlite_files_keep_nothing_of_the_old_rotation(
     store.upgrade()
     store.tenants.create("default")
     people = People(store, 12)
-    for name in people.names:
-        people.enroll(name)
+    people.enroll(*people.names)
     row = rows(store)["s007"]
     ((key,),) = execute(store.database, sa.select(RotationKeyRow.wrapped_key))
     ciphertext = pieces(row["ciphertext"])
