@@ -86,8 +86,7 @@ class Settings(BaseSettings):
 
     data_dir: Path = Field(
         Path("veilface-data"),
-        description="Folder for everything that Veilface keeps except the master key: "
-        "`contract.json`, `decoys.veil`, and the database where it is SQLite's.",
+        description="Folder of `contract.json`, `decoys.veil`, and an SQLite database.",
     )
     database_url: str | None = Field(
         None,
@@ -97,31 +96,27 @@ class Settings(BaseSettings):
     master_key_file: Path | None = Field(
         None,
         description="File with the master keys, mode 0600, one a line, the first is current; "
-        "created at first use while the database is empty. Unset: `master.key` in a folder beside "
-        "`data_dir`, of the same name with `-keys` after it. Without it, nothing that is "
-        "stored can be read again: keep a copy elsewhere, and not with the database.",
+        "created at first use. Unset: `master.key` in a folder beside `data_dir`, with `-keys` "
+        "after its name. Without it, nothing stored can be read: keep a copy apart.",
     )
     master_key_variable: str | None = Field(
         None,
         pattern=r"^[A-Za-z_][A-Za-z0-9_]*$",
-        description="Name of an environment variable that holds the master keys in base64, the "
-        "first is current, separated by commas or newlines; instead of `master_key_file`.",
+        description="Environment variable that holds the master keys in base64, the first is "
+        "current, separated by commas or newlines; instead of `master_key_file`.",
     )
     require_private: bool = Field(
         False,
-        description="Refuse to start with a contract whose privacy is not proven: its verdict is "
-        "not PASS.",
+        description="Refuse to start with a contract whose privacy is not proven.",
     )
     pack: Path | None = Field(
         None,
-        description="Model pack: a folder of ONNX files, or one embedder file. Unset: the "
-        "service accepts templates and embeddings only.",
+        description="Model pack: a folder of ONNX files, or one embedder. Unset: no photos.",
     )
     providers: Annotated[tuple[str, ...], NoDecode, BeforeValidator(_parts)] = Field(
         ("cpu",),
         min_length=1,
-        description="ONNX Runtime providers in order of preference, separated by commas. One "
-        "that is absent is an error.",
+        description="ONNX Runtime providers in order of preference, separated by commas.",
     )
     onnx_threads: int = Field(
         1, ge=1, le=MAX_ONNX_THREADS, description="Threads that one inference of the pack may use."
@@ -131,52 +126,45 @@ class Settings(BaseSettings):
         ge=0,
         le=1024,
         description="Requests of one API key that may compute at the same time in one worker, and "
-        "half of those of all keys; the others wait. 0: one for each processor that the process "
-        "may use.",
+        "half of those of all keys. 0: one for each processor that the process may use.",
     )
     queue_limit: int = Field(
         32,
         ge=1,
         le=100_000,
-        description="Requests with a body that may send it or wait for a compute slot in one "
-        "worker; further ones are answered `overloaded`. One API key gets half of the places "
-        "at most.",
+        description="Requests that may send a body or wait for a slot in one worker; further ones "
+        "are answered `overloaded`. One API key gets half of the places at most.",
     )
     workers: int = Field(1, ge=1, le=256, description="Server processes.")
     host: str = Field("127.0.0.1", description="Address to listen on.")
     port: int = Field(8421, ge=0, le=65535, description="Port to listen on; 0 takes a free one.")
     open_metrics: bool = Field(
         False,
-        description="Answer `/metrics` to everybody who reaches the port. Otherwise it needs an "
-        "API key with the right `metrics`.",
+        description="Answer `/metrics` without an API key with the right `metrics`.",
     )
     tls_certificate: Path | None = Field(
         None,
-        description="PEM file with the certificate chain for TLS on the port. Unset: plain "
-        "HTTP, for a reverse proxy on the same machine.",
+        description="PEM file with the certificate chain for TLS. Unset: plain HTTP.",
     )
     tls_key: Path | None = Field(
         None,
         validate_default=True,
-        description="PEM file with the certificate's private key, without a password, mode 0600.",
+        description="PEM file with its private key, without a password, mode 0600.",
     )
     trusted_proxies: str = Field(
         "127.0.0.1",
-        description="Addresses or networks of reverse proxies, separated by commas: only from them "
-        "`X-Forwarded-For` and `X-Forwarded-Proto` are believed. `none`: from nobody. `*`: from "
-        "everybody, so that a client can choose its address.",
+        description="Addresses or networks of reverse proxies, separated by commas, whose "
+        "`X-Forwarded-For` and `X-Forwarded-Proto` are believed; or `none`, or `*` for all.",
     )
     cors_origins: str = Field(
         NONE,
-        description="Origins of web pages that may call `/v1/` from a browser, separated by "
-        "commas, as `https://HOST` or `https://HOST:PORT`: exactly these, and never with cookies. "
-        "`none`: the service's own page alone. `*` is refused (docs/rest.md says why).",
+        description="Origins of web pages that may call `/v1/`, separated by commas, as "
+        "`https://HOST` or `https://HOST:PORT`; `*` is refused (docs/rest.md says why).",
     )
     rate_limit_key: str = Field(
         "600/minute",
         description="Requests that one API key may make in any such time, as `COUNT/second`, "
-        "`minute`, `hour` or `day`, or `COUNT per 5 minute`; further ones are answered "
-        "`rate_limited`. `off`, or an empty value in the TOML file or as a flag: no limit.",
+        "`minute`, `hour` or `day`, or `COUNT per 5 minute`; `off`: no limit.",
     )
     rate_limit_address: str = Field(
         "1200/minute",
@@ -186,15 +174,15 @@ class Settings(BaseSettings):
     rate_limit_storage: str = Field(
         "memory://",
         pattern=r"^(memory://$|rediss?://)",
-        description="Where requests are counted. `memory://`: in each worker for itself, so that "
-        "up to `workers` times the limit may pass. `redis://USER:PASSWORD@HOST/NUMBER` or "
-        "`rediss://…`: in one place, for all workers and hosts; needs `veilface[redis]`.",
+        description="Where requests are counted. `memory://`: in each worker for itself. "
+        "`redis://USER:PASSWORD@HOST/NUMBER` or `rediss://…`: in one place, for all workers and "
+        "hosts; needs `veilface[redis]`.",
     )
     lowest_level: str | None = Field(
         None,
         pattern=f"^{LEVEL_NAME.pattern}$",
-        description="Lowest security level that a verification may ask for, as the contract names "
-        "it (docs/rest.md). Unset: any. An API key may have a stricter one of its own.",
+        description="Lowest security level that a verification may ask for (docs/rest.md). Unset: "
+        "any. An API key may have a stricter one of its own.",
     )
     liveness: LivenessPolicy = Field(
         LivenessPolicy.OFF,
@@ -207,8 +195,7 @@ class Settings(BaseSettings):
         ge=0,
         le=50,
         description="Rejected verifications of one subject in a row after which it is locked for "
-        "30 seconds, and twice as long with each further one, an hour at most; after 50 until an "
-        "operator lifts it (docs/rest.md). 0: never.",
+        "30 seconds, and twice as long with each further one (docs/rest.md). 0: never.",
     )
     retention_days: int | None = Field(
         None,
@@ -225,9 +212,8 @@ class Settings(BaseSettings):
     )
     export_key_file: Path | None = Field(
         None,
-        description="File with the key for exports, mode 0600. Two deployments that share it "
-        "can exchange subjects. Unset: a key kept in the database, which only this deployment "
-        "can open.",
+        description="File with the key for exports, mode 0600, by which deployments can exchange "
+        "subjects. Unset: a key of this deployment alone.",
     )
     log_level: Literal["debug", "info", "warning", "error"] = Field(
         "info", description="Least severe log line that is written."
@@ -236,13 +222,11 @@ class Settings(BaseSettings):
         "",
         pattern=r"^(/[A-Za-z0-9._~-]+)*$",
         description="Path under which a proxy shows the service, such as `/faces` "
-        "(docs/deploy.md). The proxy may pass it on or take it away. It does not begin with a path "
-        "of the service itself, such as `/v1`.",
+        "(docs/deploy.md). The proxy may pass it on or take it away.",
     )
     web_page: bool = Field(
         True,
-        description="Serve the web page at `/` (docs/javascript.md), and the reference of the API "
-        "at `/docs`; neither needs a key.",
+        description="Serve the web page at `/`, and the reference of the API at `/docs`.",
     )
     serve_pack: bool = Field(
         False,

@@ -43,18 +43,23 @@ _MODULES = {
     "enroll": "subjects",
     "verify": "subjects",
     "audit-log": "audit_log",
-    "evaluate liveness": "evaluate_liveness",
+    "evaluate liveness": "liveness",
 }
+_GROUPS = {"audit": ("fairface", "templates"), "bench": ("distances", "models")}
+"""Commands that have a module of their own; those of other groups are in one."""
 
 _LOOKS: dict[str, Any] = {"rich_markup_mode": "markdown", "pretty_exceptions_enable": False}
 
 
 def load(name: str) -> Any:
-    """Import a command."""
-    module = import_module(f"api.cli.{_MODULES.get(name, name)}")
-    around = typer.Typer(**_LOOKS)
-    if hasattr(module, "app"):
-        around.add_typer(module.app, name=name)
+    """Import a command, or all commands of a group."""
+    around, group = typer.Typer(**_LOOKS), typer.Typer(no_args_is_help=True)
+    parts = _GROUPS.get(name, ())
+    for part in parts:
+        group.command()(getattr(import_module(f"api.cli.{name}_{part}"), part))
+    module = None if parts else import_module(f"api.cli.{_MODULES.get(name, name)}")
+    if parts or hasattr(module, "app"):
+        around.add_typer(getattr(module, "app", group), name=name, help=COMMANDS[name])
     else:
         around.command(name)(getattr(module, name.replace(" ", "_")))
     return typer.main.get_group(around).commands[name]
@@ -110,13 +115,7 @@ def _show_version(asked: bool) -> None:
 @app.callback()
 def _root(
     _version: Annotated[
-        bool,
-        typer.Option(
-            "--version",
-            callback=_show_version,
-            is_eager=True,
-            help="Print the version and exit.",
-        ),
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print it.")
     ] = False,
 ) -> None:
     """Take the options that stand before a command."""

@@ -5,11 +5,12 @@ from typing import Annotated
 
 import typer
 
+from api.cli import flags
 from api.cli.audit_report import Limits, Out, limits_of, reported
-from api.cli.bulk import BULK, Aligned, Bulk, Cache, Flip, Seed, listed, listed_numbers
+from api.cli.bulk import BULK, Bulk, listed, listed_numbers
 from api.cli.console import share_done
 from api.cli.errors import UsageError, require_extra
-from api.cli.options import PROCESSOR, Device, Plan, reports, torch_device
+from api.cli.options import PROCESSOR, Plan, reports, torch_device
 from api.cli.results import Result
 from api.settings import Settings
 from attacks.attributes.audit import (
@@ -60,17 +61,12 @@ def fairface(
     generated_dim: Annotated[
         str, typer.Option(help="Dimensions with generated decoys, beside the contract's.")
     ] = ",".join(map(str, OUR_DIMS)),
-    decoys: Annotated[
-        Path | None,
-        typer.Option(
-            help="The decoy generator. Unset: `decoys.veil` in `data_dir`, else one fitted here."
-        ),
-    ] = None,
-    seed: Seed = 0,
-    aligned: Aligned = False,
-    flip: Flip = False,
-    cache: Cache = None,
-    device: Device = PROCESSOR,
+    decoys: flags.Decoys = None,
+    seed: flags.Seed = 0,
+    aligned: flags.Aligned = False,
+    flip: flags.Flip = False,
+    cache: flags.Cache = None,
+    device: flags.Device = PROCESSOR,
     limit: Limits = None,
     out: Out = Path("audit-fairface"),
     _plan: Plan = None,
@@ -80,7 +76,7 @@ def fairface(
     Writes report.json, report.md and figures, the paper's among them, to --out. The verdict is on
     the scheme of the contract in `data_dir` where it is of these decoys, else on the last of
     --generated-dim. Exit status 1: the strongest attacker exceeds the limit; 3: none does, and too
-    few faces show it. docs/privacy.md explains every figure.
+    few faces show it. Where there are no decoys, some are fitted to the lifting database.
 
     Example: `veilface audit fairface fairface --pack buffalo_l --out audit`
     """

@@ -7,16 +7,17 @@ from typing import Annotated, Any
 
 import typer
 
+from api.cli import flags
 from api.cli.console import progress, say
 from api.cli.errors import UsageError
-from api.cli.files import read_bounded
 from api.cli.options import STORE, reports
 from api.cli.results import Result
-from api.cli.store import PublicKey, read_public_key
+from api.cli.store import read_public_key
 from api.http.audit import operator
 from api.http.schemas import iso_time
 from api.service.opening import checked_store
 from api.settings import DEFAULT_TENANT, Settings
+from templates.keys.private_file import read_bounded
 from templates.store import archive_audit_log, verify_audit_log
 from templates.store.audit_archive import Archive, verify_archive
 from templates.store.audit_chain import Anchor
@@ -28,11 +29,6 @@ MAX_ANCHOR_BYTES = 4096
 app = typer.Typer(no_args_is_help=True)
 
 
-@app.callback()
-def audit_log() -> None:
-    """Verify, read and archive the audit log, a chain of lines."""
-
-
 @app.command()
 @reports(*STORE)
 def verify(
@@ -40,18 +36,14 @@ def verify(
     settings: Settings,
     anchor: Annotated[
         str | None,
-        typer.Option(
-            help="What `audit-log head` wrote earlier, or a file with it: also finds a log that "
-            "was put back to an older state, head and all."
-        ),
+        typer.Option(help="What `head` wrote earlier, or its file: also finds a log put back."),
     ] = None,
 ) -> Result:
     """Check the audit log, and keys and lockouts against it; exit status 1 if anything is wrong.
 
-    Needs: the database and its master key; the service may run meanwhile. Names the first line that
-    was altered, removed, added or moved; else API keys that were made up, altered or put back,
-    enrollments and tenants that were put back, changed settings of tenants, and lowered counts of
-    failed attempts. Lines in an archive are not used.
+    Names the first line that was altered, removed, added or moved; else what was made up, altered
+    or put back of API keys, enrollments, tenants and counts of failed attempts. Lines in an archive
+    are not used.
 
     Example: `veilface audit-log verify --anchor head.txt`
     """
@@ -82,8 +74,7 @@ def archive(
     *,
     settings: Settings,
     through: Annotated[
-        int | None,
-        typer.Option(min=1, help="Number of the last line to move. Unset: all there are."),
+        int | None, typer.Option(min=1, help="Number of the last line to move. Unset: all.")
     ] = None,
 ) -> Result:
     """Move old lines of the audit log into a signed file.
@@ -102,7 +93,7 @@ def archive(
 def verify_archive_file(
     file: Annotated[Path, typer.Argument(help="What `archive` wrote.")],
     *,
-    public_key: PublicKey,
+    public_key: flags.PublicKey,
 ) -> Result:
     """Check an archive's signature and lines; exit status 1 if they are not good.
 
@@ -139,8 +130,7 @@ def show(
     *,
     settings: Settings,
     subject: Annotated[
-        str | None,
-        typer.Option(help="Only lines on this subject, of `--tenant`."),
+        str | None, typer.Option(help="Only lines on this subject, of `--tenant`.")
     ] = None,
     tenant: Annotated[str | None, typer.Option(help="Only lines of this tenant.")] = None,
     after: Annotated[int, typer.Option(min=0, help="Begin after this line.")] = 0,

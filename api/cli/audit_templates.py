@@ -5,16 +5,16 @@ from typing import Annotated
 
 import typer
 
+from api.cli import flags
 from api.cli.audit_report import Limits, Out, limits_of, reported
-from api.cli.bulk import BULK, Aligned, Bulk, Cache, Decoys, Flip, Seed, listed_numbers
+from api.cli.bulk import BULK, Bulk, listed_numbers
 from api.cli.console import message, share_done
-from api.cli.errors import UsageError, require_extra
-from api.cli.options import PROCESSOR, Device, Plan, reports, torch_device
+from api.cli.errors import require_extra
+from api.cli.options import PROCESSOR, Plan, reports, torch_device
 from api.cli.results import Result
 from api.settings import Settings
 from attacks.audit import AuditPlan, run_audit
 from attacks.report import document
-from templates.contract.document import Contract
 from templates.decoys.fitting import MIN_DESCRIPTORS
 from templates.distances import on_device
 from templates.space.lifting import Strategy
@@ -27,14 +27,7 @@ def templates(
     people: Annotated[Path, typer.Argument(help="Labelled faces, one subfolder for each person.")],
     *,
     settings: Settings,
-    decoys: Decoys = None,
-    contract: Annotated[
-        Path | None,
-        typer.Option(
-            help="Audit this contract. Unset: that in `data_dir` where it is of these decoys, "
-            "unless --strategy, --dim or --axes describes a scheme."
-        ),
-    ] = None,
+    decoys: flags.Decoys = None,
     strategy: Annotated[
         Strategy | None, typer.Option(help="How templates of a scheme are lifted: adversarial.")
     ] = None,
@@ -52,19 +45,21 @@ def templates(
     comparison: Annotated[
         bool, typer.Option(help="Show on decoys of real people that the attacks work.")
     ] = True,
-    seed: Seed = 0,
-    aligned: Aligned = False,
-    flip: Flip = False,
-    cache: Cache = None,
-    device: Device = PROCESSOR,
+    seed: flags.Seed = 0,
+    aligned: flags.Aligned = False,
+    flip: flags.Flip = False,
+    cache: flags.Cache = None,
+    device: flags.Device = PROCESSOR,
     limit: Limits = None,
     out: Out = Path("audit-templates"),
     _plan: Plan = None,
 ) -> Result:
     """Attack private templates: inversion, linkage, renewal, impersonation.
 
-    Writes report.json, report.md and figures to --out. Exit status 1: an attack exceeds its limit;
-    3: none does, and too few people or faces show it. docs/privacy.md leads to what each attack is.
+    Of the contract in `data_dir` where it is of these decoys; or of schemes that --strategy, --dim
+    or --axes describe, calibrated on people of PEOPLE who are not attacked. Writes report.json,
+    report.md and figures to --out. Exit status 1: an attack exceeds its limit; 3: none does, and
+    too few people or faces show it. docs/privacy.md leads to what each attack is.
 
     Example: `veilface audit templates lfw --pack buffalo_l --decoys decoys.veil --out audit`
     """
@@ -72,24 +67,15 @@ def templates(
     limits = limits_of(limit)
     on = torch_device(device)
     bulk = Bulk(settings, aligned=aligned, flip=flip, cache_file=cache)
-    own_scheme = any(one is not None for one in (strategy, dim, axes))
-    if contract is not None and own_scheme:
-        raise UsageError(
-            "a contract says its strategy, dimension and axes: leave out --strategy, --dim, --axes"
-        )
     source = bulk.decoys(decoys)
-    audited = None
-    if contract is not None:
-        audited = Contract.load(contract, bulk.sealer)
-        served = source.reduced(audited.binding.axes)
-        audited.binding.require_source(served)
-    elif not own_scheme and (audited := bulk.served_contract(source)) is not None:
+    contract = None
+    if not (strategy or dim or axes) and (contract := bulk.served_contract(source)) is not None:
         message(f"note: auditing the contract {settings.resolved_contract_file}")
     plan = AuditPlan(
         strategy=strategy or Strategy.ADVERSARIAL,
         dims=listed_numbers(dim or "64", "--dim", most=(axes or source.k) - 1),
         axes=axes,
-        contract=audited,
+        contract=contract,
         victims=victims,
         owners=owners,
         comparison=comparison,

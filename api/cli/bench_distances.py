@@ -1,9 +1,7 @@
 """``veilface bench distances``: distances beside the matrix product that they cannot do without.
 
-A distance starts from the products of stacked rows (CONTRIBUTING.md, "Distances"). All
-of them in one matrix of its own is the *bare product*. The distances and the product are timed in
-turn, so that what else the machine does meets them alike, and compared repeat by repeat. Beside
-them stands the paper's formula as its authors compute it, on fewer pairs.
+A distance starts from the products of stacked rows (CONTRIBUTING.md, "Distances"). All are timed
+in turn, so that what else the machine does meets them alike, and compared repeat by repeat.
 """
 
 import statistics
@@ -16,10 +14,11 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
+from api.cli import flags
 from api.cli.bulk import listed_numbers
 from api.cli.console import progress
 from api.cli.errors import require_extra
-from api.cli.options import PROCESSOR, Device, reports, torch_device
+from api.cli.options import PROCESSOR, reports, torch_device
 from api.cli.results import Result
 from api.settings import processors
 from templates.distances import Metric, Probes, on_device, pairwise_distances
@@ -38,15 +37,11 @@ AUTHORS_COUNT = 100
 @reports()
 def distances(
     *,
-    count: Annotated[
-        int, typer.Option(min=1, help="Probes, and templates: COUNT × COUNT distances.")
-    ] = 1000,
+    count: Annotated[int, typer.Option(min=1, help="Probes, and templates.")] = 1000,
     n: Annotated[str, typer.Option("--n", help="Numbers in an embedding.")] = "128,512",
     dim: Annotated[str, typer.Option(help="Dimensions m of the subspaces.")] = "2,4,8,16",
-    repeats: Annotated[
-        int, typer.Option(min=1, help="Timed repeats; medians of them are shown.")
-    ] = 5,
-    device: Device = PROCESSOR,
+    repeats: Annotated[int, typer.Option(min=1, help="Timed repeats, of which medians.")] = 5,
+    device: flags.Device = PROCESSOR,
 ) -> Result:
     """Time all distances between probes and templates, beside the bare matrix product.
 

@@ -1,13 +1,12 @@
 """``veilface bench models``: with which settings a pack answers soonest, and with which most often.
 
 Whole photos are timed from their bytes to their embedding, sent by several callers at once through
-as many compute slots as a service would have. What is compared is timed in turn, so that what else
-the machine does meets it alike.
+as many compute slots as a service would have, all settings in turn.
 """
 
 import statistics
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -27,12 +26,10 @@ from api.cli.results import Result
 from api.settings import MAX_ONNX_THREADS, Settings, processors
 from models.errors import ModelError
 from models.pack import ModelPack
-from models.synthetic import draw_face, encode_photo
 
 PHOTOS_EACH = 4
 """Photos that each caller sends in one repeat."""
-DRAWN, PEOPLE = 4, 40
-"""Photos that are drawn, of so many people at most: a detector does not take each for a face."""
+MOST_PHOTOS = 100
 # What a photo costs is asked, not whether the gate lets it pass.
 _embed = partial(ModelPack.embed_photo, policy=None, quality=None)
 
@@ -54,25 +51,18 @@ class Row:
 
 @reports("pack", "providers")
 def models(
+    photos: Annotated[list[Path], typer.Argument(help="Photos with a face.")],
     *,
     settings: Settings,
-    photo: Annotated[
-        list[Path] | None,
-        typer.Option(
-            help="A photo with a face; repeat for more. Unset: some are drawn.", show_default=False
-        ),
-    ] = None,
     threads: Annotated[str, typer.Option(help="Values of `onnx_threads` to try.")] = "1,2,4",
-    repeats: Annotated[
-        int, typer.Option(min=1, help="Timed repeats; medians of them are shown.")
-    ] = 9,
+    repeats: Annotated[int, typer.Option(min=1, help="Timed repeats, of which medians.")] = 9,
 ) -> Result:
     """Time a pack, and say which `onnx_threads` and `compute_slots` suit this machine.
 
-    Needs: a pack. Run it where the service will run, while little else runs there. Whole photos are
-    timed with one caller, one for each processor, and twice as many. Takes some minutes.
+    Run it where the service will run, while little else runs there. Whole photos are timed with one
+    caller, one for each processor, and twice as many. Takes some minutes.
 
-    Example: `veilface bench models --pack ~/.insightface/models/buffalo_l`
+    Example: `veilface bench models anna-1.jpg anna-2.jpg --pack ~/.insightface/models/buffalo_l`
     """
     if settings.pack is None:
         raise UsageError("a pack is what is timed; name it with --pack")
@@ -82,7 +72,27 @@ def models(
         for count in listed_numbers(threads, "--threads", most=MAX_ONNX_THREADS)
     }
     one = next(iter(packs.values()))
-    rows = time_photos(packs, _usable(one, photo or []), repeats=repeats, here=here)
+    data = read_photos(photos, most=MOST_PHOTOS)
+    for path, photo in zip(photos, data, strict=True):
+        try:
+            _embed(one, photo)
+        except ModelError as error:
+            raise CommandError(f"{path}: {error}") from None
+    keys = [
+        (callers, count, slots)
+        for callers, count in product(sorted({1, here, 2 * here}), packs)
+        # Further slots than callers would stay empty.
+        for slots in sorted({min(callers, max(1, s)) for s in (here // 2, here, 2 * here)})
+    ]
+    loads = np.empty((repeats + 1, len(keys), 3))
+    with progress("measuring", loads.shape[0] * len(keys)) as done:
+        for turn in loads:
+            for place, (callers, count, slots) in enumerate(keys):
+                turn[place] = _load(packs[count], data, callers=callers, slots=slots)
+                done(1)
+    # The first round only fetches code and memory.
+    medians = np.median(loads[1:], axis=0).tolist()
+    rows = [Row(*key, *median) for key, median in zip(keys, medians, strict=True)]
     return Result(
         {
             "pack": one.info.name,
@@ -94,27 +104,6 @@ def models(
             **demo_notice(one.info),
         }
     )
-
-
-def time_photos(
-    packs: Mapping[int, ModelPack], photos: Sequence[bytes], *, repeats: int, here: int
-) -> list[Row]:
-    """Time photos with packs by their threads."""
-    keys = [
-        (callers, threads, slots)
-        for callers, threads in product(sorted({1, here, 2 * here}), packs)
-        # Further slots than callers would stay empty.
-        for slots in sorted({min(callers, max(1, s)) for s in (here // 2, here, 2 * here)})
-    ]
-    loads = np.empty((repeats + 1, len(keys), 3))
-    with progress("measuring", loads.shape[0] * len(keys)) as advance:
-        for turn in loads:
-            for place, (callers, threads, slots) in enumerate(keys):
-                turn[place] = _load(packs[threads], photos, callers=callers, slots=slots)
-                advance(1)
-    # The first round only fetches code and memory.
-    medians = np.median(loads[1:], axis=0).tolist()
-    return [Row(*key, *median) for key, median in zip(keys, medians, strict=True)]
 
 
 def advice(rows: Sequence[Row]) -> str:
@@ -146,24 +135,3 @@ def _load(
         times = list(calling.map(call, calls))
         spent = time.perf_counter() - wall, (time.process_time() - cpu) * 1000
     return len(calls) / spent[0], statistics.median(times), spent[1] / len(calls)
-
-
-def _usable(pack: ModelPack, own: Sequence[Path]) -> list[bytes]:
-    """Photos that the pack can embed: one's own, or drawn ones of people who do not exist."""
-    photos = read_photos(own, most=100)
-    for path, photo in zip(own, photos, strict=True):
-        try:
-            _embed(pack, photo)
-        except ModelError as error:
-            raise CommandError(f"{path}: {error}") from None
-    if photos:
-        return photos
-    if pack.info.detector is None:
-        return [encode_photo(draw_face(who, size=pack.crop_size)) for who in range(DRAWN)]
-    for who in range(PEOPLE):
-        picture = np.pad(draw_face(who, size=224), ((128, 128), (208, 208), (0, 0)), "edge")
-        if pack.detect(picture):
-            photos.append(encode_photo(picture))
-        if len(photos) == DRAWN:
-            return photos
-    raise CommandError("the pack's detector sees no face in drawn photos; name others with --photo")

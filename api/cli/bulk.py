@@ -5,9 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
-
-import typer
+from typing import Any, TypeVar
 
 from api.cli.console import message, progress
 from api.cli.errors import CommandError, UsageError
@@ -24,41 +22,6 @@ from templates.keys.sealing import Sealer
 from verify.preparation import acquired, recorded_of, require_made_with, without_lookalikes
 
 BULK = ("pack", "providers", "data_dir", "database_url", "master_key_file")
-
-Aligned = Annotated[
-    bool, typer.Option("--aligned", help="The photos are aligned square crops already.")
-]
-Flip = Annotated[
-    bool,
-    typer.Option("--flip", help="Add the embedding of the mirrored face, here and in all others."),
-]
-Cache = Annotated[
-    Path | None,
-    typer.Option(help="Keep embeddings in this sealed file, so that the next run is quick."),
-]
-Decoys = Annotated[
-    Path | None,
-    typer.Option(help="The file of `decoys build`. Unset: `decoys.veil` in `data_dir`."),
-]
-Exclude = Annotated[
-    Path | None,
-    typer.Option(
-        help="People or photos to leave out: a text file with a name or a path on each line, or a "
-        "folder whose subfolders are named like the people."
-    ),
-]
-Labels = Annotated[
-    Path | None,
-    typer.Option(help="A CSV `path,gender,race,age,...` of photos or people: rates by group."),
-]
-Like = Annotated[
-    list[Path] | None,
-    typer.Option(
-        help="Folder of 600 photos or more (at least 100 of 50 people) of further people of the "
-        "kind that will be enrolled: decoys are adapted to them."
-    ),
-]
-Seed = Annotated[int, typer.Option(min=0, help="Seed for the random choices.")]
 
 T = TypeVar("T")
 
@@ -151,7 +114,7 @@ def listed(text: str, kind: Callable[[str], T], option: str, *, expected: str) -
     """Read a list with commas, each value once; ``expected`` is said of anything else."""
     try:
         values = [kind(part.strip()) for part in text.split(",") if part.strip()]
-    except ValueError:
+    except (ValueError, KeyError):
         values = []
     if not values:
         raise UsageError(f"{option} takes {expected}, not {text!r}")

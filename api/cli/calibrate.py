@@ -6,28 +6,17 @@ from typing import Annotated
 
 import typer
 
-from api.cli.bulk import (
-    BULK,
-    Aligned,
-    Bulk,
-    Cache,
-    Decoys,
-    Exclude,
-    Flip,
-    Labels,
-    Seed,
-    each_person_once,
-    listed_numbers,
-)
-from api.cli.calibrate_liveness import set_liveness_threshold, with_liveness_of
-from api.cli.calibration import DEFAULT_PROBE_DIM, calibrate_folder, default_probe_dims
-from api.cli.console import counted, demo_notice, share_done
+from api.cli import flags
+from api.cli.bulk import BULK, Bulk, each_person_once, listed_numbers
+from api.cli.calibration import DEFAULT_PROBE_DIM, calibrate_folder
+from api.cli.console import demo_notice, share_done
 from api.cli.errors import UsageError
 from api.cli.files import read_names
+from api.cli.liveness import set_liveness_threshold, with_liveness_of
 from api.cli.options import reports
 from api.cli.photo_folders import people_or_faces
 from api.cli.results import Result, Table
-from api.cli.verdict import improvements, shown_rate, verdict_lines
+from api.cli.verdict import shown_rate, verdict_lines
 from api.settings import Settings
 from templates.contract.binding import MAX_M
 from templates.contract.document import Calibration, Contract
@@ -55,7 +44,7 @@ def calibrate(
     ] = None,
     *,
     settings: Settings,
-    decoys: Decoys = None,
+    decoys: flags.Decoys = None,
     out: Annotated[
         Path | None,
         typer.Option(help="The contract file. Unset: `contract.json` in `data_dir`."),
@@ -88,11 +77,11 @@ def calibrate(
         Protocol,
         typer.Option(help="`ten-fold` adds the paper's threshold of best accuracy as a level."),
     ] = "fmr",
-    aligned: Aligned = False,
-    flip: Flip = False,
-    cache: Cache = None,
-    exclude_people: Exclude = None,
-    labels: Labels = None,
+    aligned: flags.Aligned = False,
+    flip: flags.Flip = False,
+    cache: flags.Cache = None,
+    exclude_people: flags.Exclude = None,
+    labels: flags.Labels = None,
     worst_group: Annotated[
         bool, typer.Option("--worst-group", help="Levels keep their FMR in each group, too.")
     ] = False,
@@ -107,14 +96,13 @@ def calibrate(
         float,
         typer.Option(min=1e-4, max=0.5, help="With --liveness: live photos that may be refused."),
     ] = 0.05,
-    seed: Seed = 0,
+    seed: flags.Seed = 0,
 ) -> Result:
     """Calibrate on labelled people, and write the contract file.
 
-    Needs: a model pack, a decoys file, and photos of people with two photos or more each. 80
-    people resolve FMR 1e-2 and 1e-3; a level that the data cannot resolve is left out. Of faces
-    that nobody labelled, rejections are not measured. The contract file belongs to the master key
-    that is in force. docs/thresholds.md explains it.
+    80 people with two photos or more each resolve FMR 1e-2 and 1e-3; a level that the data cannot
+    resolve is left out. Of faces that nobody labelled, rejections are not measured.
+    docs/thresholds.md explains it.
 
     Example: `veilface calibrate lfw --pack buffalo_l --decoys decoys.veil --out contract.json
     --strategy adversarial`
@@ -124,7 +112,10 @@ def calibrate(
         return set_liveness_threshold(liveness, path, settings, bpcer=bpcer)
     if folder is None or liveness is not None:
         raise UsageError("give the folder of labelled people, or --liveness and its photos")
-    dims = default_probe_dims(dim) if probe_dims is None else parse_dims(probe_dims)
+    dims: tuple[int, ...] = (DEFAULT_PROBE_DIM,)
+    if probe_dims is not None:
+        is_none = probe_dims.strip() == "none"
+        dims = () if is_none else listed_numbers(probe_dims, "--probe-dims", most=MAX_M)
     bulk = Bulk(settings, aligned=aligned, flip=flip, cache_file=cache)
     n = bulk.pack.info.n
     if not (dim or 1) < (axes or n) <= n:
@@ -159,7 +150,7 @@ def calibrate(
                 seed=seed,
             ),
             labels=groups,
-            progress=lambda _what, share: report(share),
+            progress=report,
         )
     contract = with_liveness_of(path, done.contract, bulk)
     contract.save(path, bulk.sealer)
@@ -177,19 +168,15 @@ def calibrate(
         [
             *map(levels_table, contract.calibrations),
             *_group_table(contract),
-            *_report_text(contract, done.report),
+            *suspicious(done.report),
+            *(f"Not set: {sentence}." for sentence in done.report.unresolved),
+            *(f"Not in the rule of the worst group: {one}." for one in done.report.left_out),
             f"{acquired(extraction)}.",
             f"{path}: contract {contract.contract_id[:16]}.",
             f"m = {done.point.dim} of {done.point.axes} axes: {done.point.chosen}.",
-            *improvements(done.verdict),
-            *verdict_lines(done.verdict),
+            *verdict_lines(contract.verdict),
         ],
     )
-
-
-def parse_dims(text: str) -> tuple[int, ...]:
-    """Read ``2,4,8``, or ``none``; :class:`UsageError` for anything else."""
-    return () if text.strip() == "none" else listed_numbers(text, "--probe-dims", most=MAX_M)
 
 
 def levels_table(calibration: Calibration) -> Table:
@@ -232,27 +219,10 @@ def _group_table(contract: Contract) -> list[Table]:
     return [Table(title, ("attribute", "group", "FMR within (95 %)", "FRR (95 %)"), rows)]
 
 
-def _report_text(contract: Contract, report: CalibrationReport) -> list[str]:
-    consistency = report.consistency
-    return [
-        *(f"Not set: {sentence}." for sentence in report.unresolved),
-        *(f"Not in the rule of the worst group: {sentence}." for sentence in report.left_out),
-        *suspicious_lines(report),
-        f"Default level: {contract.default_level}. Photos of one enrollment must agree to "
-        f"{contract.photo_consistency:.3f}: {shown_rate(consistency.refused)} of the genuine sets "
-        f"do not; {shown_rate(consistency.fmr)} of the pairs of two people do. Photos of one probe "
-        f"must agree to {contract.probe_consistency:.3f}.",
-    ]
-
-
-def suspicious_lines(report: CalibrationReport) -> list[str]:
-    """Name the pairs of people who may be one, most alike first."""
-    pairs = report.suspicious
-    if not pairs:
-        return []
-    return [
-        f"Suspiciously alike, with a cosine above {SUSPICIOUS_ABOVE:g}: "
-        f"{counted(len(pairs), 'pair')} of people, the first {MOST_SHOWN} of them below; look at "
-        "them, and put the photos of one person into one folder:",
-        *(f"  {pair.first}, {pair.second}: {pair.cosine:.3f}" for pair in pairs[:MOST_SHOWN]),
-    ]
+def suspicious(report: CalibrationReport) -> list[Table]:
+    """Show the pairs of people who may be one, most alike first."""
+    title = (
+        f"suspiciously alike (cosine above {SUSPICIOUS_ABOVE:g}): put one person into one folder"
+    )
+    rows = [(pair.first, pair.second, f"{pair.cosine:.3f}") for pair in report.suspicious]
+    return [Table(title, ("person", "person", "cosine"), rows[:MOST_SHOWN])] if rows else []

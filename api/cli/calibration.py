@@ -4,11 +4,8 @@ Axes and dimension are chosen, and privacy is judged, by attacks; so this lies a
 ``verify`` and ``attacks``. The commands ``calibrate`` and ``setup``, and the demo, call it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-
-import numpy as np
-from numpy.typing import NDArray
 
 from attacks.operating_point import OperatingPoint, choose_and_judge, judge_accuracy, judge_groups
 from attacks.setup import AttackSetup
@@ -20,8 +17,6 @@ from templates.decoys import DecoyPool, DecoySource
 from templates.distances.blas import single_threaded
 from templates.space.lifting import Strategy, plain_strategy
 from verify import CalibrationOptions, CalibrationReport, LabelledFolder, calibrate
-from verify.calibration import part_of
-from verify.comparisons import Progress
 from verify.group_rates import PhotoLabels
 from verify.own_decoys import require_others
 from verify.preparation import PreparationError, binding_for, recorded_of
@@ -32,17 +27,11 @@ SEARCHED = 0.6
 """Share of a calibration's time that has passed, on LFW, once axes and dimension are chosen."""
 
 
-def default_probe_dims(m: int | None) -> tuple[int, ...]:
-    """Dimensions of lifted probes where none are asked for: no larger than the templates'."""
-    return (DEFAULT_PROBE_DIM if m is None else min(DEFAULT_PROBE_DIM, m),)
-
-
 @dataclass(frozen=True)
 class CalibratedFolder:
     """A contract with its verdict, the report of its calibration, and why it has its dimension."""
 
     contract: Contract
-    verdict: Verdict
     report: CalibrationReport
     point: OperatingPoint
 
@@ -58,12 +47,12 @@ def calibrate_folder(
     m: int | None = None,
     options: CalibrationOptions,
     labels: PhotoLabels | None = None,
-    progress: Progress = lambda _what, _share: None,
+    progress: Callable[[float], None] = lambda _share: None,
 ) -> CalibratedFolder:
     """Calibrate on the embeddings of a labelled folder; judge privacy, accuracy and groups.
 
     ``source`` has all of its axes. ``axes`` and ``m`` that are None are chosen: what rejects the
-    fewest genuine probes of all that is private.
+    fewest genuine probes of all that is private. ``progress`` is called with the share done.
     """
     if not strategy.needs_decoys:
         raise PreparationError(
@@ -73,21 +62,33 @@ def calibrate_folder(
     name_of = dict(zip(folder.paths, folder.identities, strict=True))
     names = [name_of[path] for path in extraction.paths]
     require_others(source, extraction.embeddings, names)
+    plain, uncovered = plain_strategy(strategy), None
+    if isinstance(source, DecoyPool):
+        uncovered = (
+            "an attacker with the pool finds the decoys, and no attack of a calibration has it"
+        )
+    elif plain is not strategy:
+        uncovered = f"the attacks are on {plain} lifting, not on what {strategy} chooses by"
     # Thousands of products of small matrices: with a second thread for each, the library spends
     # most of its time waiting. The distances have threads of their own.
     with single_threaded():
-        point = operating_point(
+        setup = AttackSetup.of_people(
             extraction.embeddings,
             names,
             source,
+            photos=options.photos_per_enrollment,
+            seed=options.seed,
+        )
+        point = choose_and_judge(
+            setup,
             strategy=strategy,
             axes=axes,
             m=m,
-            options=options,
-            progress=part_of(progress, 0.0, SEARCHED),
+            uncovered=uncovered,
+            progress=lambda share: progress(SEARCHED * share),
         )
         source = source.reduced(point.axes)
-        probe_dims = tuple(dim for dim in options.probe_dims if dim <= point.dim)
+        probe_dims = tuple(dict.fromkeys(min(dim, point.dim) for dim in options.probe_dims))
         done = calibrate(
             extraction.embeddings,
             names,
@@ -97,7 +98,7 @@ def calibrate_folder(
             labels=labels,
             recorded=recorded_of(pack),
             dataset=folder.root.resolve().name,
-            progress=part_of(progress, SEARCHED, 1.0),
+            progress=lambda _, share: progress(SEARCHED + (1 - SEARCHED) * share),
         )
     accuracy = None
     if len(set(names)) < len(names):
@@ -105,39 +106,4 @@ def calibrate_folder(
             done.contract, photos=extraction.attempts, not_acquired=len(extraction.failures)
         )
     verdict = Verdict(point.privacy, accuracy, judge_groups(done.contract))
-    return CalibratedFolder(replace(done.contract, verdict=verdict), verdict, done.report, point)
-
-
-def operating_point(
-    descriptors: NDArray[np.float32],
-    names: Sequence[str],
-    source: DecoySource,
-    *,
-    strategy: Strategy,
-    axes: int | None,
-    m: int | None,
-    options: CalibrationOptions,
-    progress: Progress,
-) -> OperatingPoint:
-    """Choose what is not asked for, and judge how private it is."""
-    what = "attacking templates"
-    progress(what, 0.0)
-    setup = AttackSetup.of_people(
-        descriptors, names, source, photos=options.photos_per_enrollment, seed=options.seed
-    )
-    plain = plain_strategy(strategy)
-    uncovered = None
-    if isinstance(source, DecoyPool):
-        uncovered = (
-            "an attacker with the pool finds the decoys, and no attack of a calibration has it"
-        )
-    elif plain is not strategy:
-        uncovered = f"the attacks are on {plain} lifting, not on what {strategy} chooses by"
-    return choose_and_judge(
-        setup,
-        strategy=strategy,
-        axes=axes,
-        m=m,
-        uncovered=uncovered,
-        progress=lambda share: progress(what, share),
-    )
+    return CalibratedFolder(replace(done.contract, verdict=verdict), done.report, point)

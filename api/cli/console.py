@@ -10,9 +10,13 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import typer
+
+if TYPE_CHECKING:
+    from models.pack import PackInfo
+    from templates.contract.document import Binding
 
 Advance = Callable[[float], None]
 
@@ -40,26 +44,7 @@ def drop_unwritten() -> None:
             os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
-def counted(number: int, noun: str) -> str:
-    """Return a number with its noun: ``1 photo``, ``2 photos``."""
-    return f"{number:,} {noun}{'' if number == 1 else 's'}"
-
-
-class Embedded(Protocol):
-    """A pack or a binding, as far as it says what gave the embeddings."""
-
-    @property
-    def embedder_sha256(self) -> str:
-        """SHA-256 of the embedder's file."""
-        ...
-
-    @property
-    def n(self) -> int:
-        """Numbers in an embedding."""
-        ...
-
-
-def demo_notice(made_by: Embedded) -> dict[str, str]:
+def demo_notice(made_by: "PackInfo | Binding") -> dict[str, str]:
     """Say so on stderr where the embedder is the demo model; the same as a part of JSON."""
     # Imported here, since commands that touch no model shall not wait for its libraries.
     from models.demo import DEMO_DIMENSION, DEMO_NOTICE, is_demo_model
@@ -73,10 +58,7 @@ def demo_notice(made_by: Embedded) -> dict[str, str]:
 
 @contextmanager
 def progress(description: str, total: float | None) -> Iterator[Advance]:
-    """Show on stderr how much of ``total`` is done; the result is called with what is done since.
-
-    Of an unknown total, as None, only the amount is shown.
-    """
+    """Show on stderr how much of ``total`` is done; call the result with what is done since."""
     from rich import console, progress
 
     terminal = console.Console(stderr=True)

@@ -1,12 +1,14 @@
 """``veilface db``: the schema of the database, and its files."""
 
+from contextlib import closing
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from api.cli import flags
 from api.cli.errors import UsageError
-from api.cli.options import STORE, Tenant, reports
+from api.cli.options import STORE, reports
 from api.cli.results import Result, as_json
 from api.http.audit import operator
 from api.http.receipts import receipt_json
@@ -19,11 +21,6 @@ from templates.store.migrate import current_revision, head_revision
 app = typer.Typer(no_args_is_help=True)
 
 
-@app.callback()
-def db() -> None:
-    """Migrate, check and clean up the database; set up tenants."""
-
-
 @app.command()
 @reports(*STORE)
 def upgrade(*, settings: Settings) -> Result:
@@ -34,13 +31,10 @@ def upgrade(*, settings: Settings) -> Result:
 
     Example: `veilface db upgrade --database-url postgresql+psycopg://veilface@localhost/veilface`
     """
-    store = open_store(settings, open_keyring(settings))
-    try:
+    with closing(open_store(settings, open_keyring(settings))) as store:
         before = current_revision(store.database)
         store.upgrade()
         return Result({"before": before, "after": current_revision(store.database)})
-    finally:
-        store.close()
 
 
 @app.command()
@@ -52,15 +46,13 @@ def check(*, settings: Settings) -> Result:
 
     Example: `veilface db check --data-dir veilface-data`
     """
-    store = open_store(settings, open_keyring(settings))
     current, reason = None, None
-    try:
-        current = current_revision(store.database)
-        store.check()
-    except VeilfaceError as error:
-        reason = str(error)
-    finally:
-        store.close()
+    with closing(open_store(settings, open_keyring(settings))) as store:
+        try:
+            current = current_revision(store.database)
+            store.check()
+        except VeilfaceError as error:
+            reason = str(error)
     facts = {"ok": reason is None, "reason": reason, "current": current, "needed": head_revision()}
     return Result(facts, error=reason)
 
@@ -70,9 +62,8 @@ def check(*, settings: Settings) -> Result:
 def compact(*, settings: Settings) -> Result:
     """Rewrite the database files, so that no page keeps erased data.
 
-    On PostgreSQL this is `VACUUM (FULL)` of every table of the store: it removes what is
-    left of erased rows and needs as much free disk. SQLite overwrites erased rows at once; its
-    `VACUUM` gives free space back and needs as much free memory. Writes wait meanwhile.
+    On PostgreSQL this is `VACUUM (FULL)` of every table of the store, and needs as much
+    free disk; on SQLite, which overwrites erased rows at once, `VACUUM`. Writes wait meanwhile.
 
     Example: `veilface db compact --data-dir veilface-data`
     """
@@ -87,7 +78,7 @@ def unlock(
     subject: Annotated[str, typer.Argument(help="Subject to unlock.")],
     *,
     settings: Settings,
-    tenant: Tenant = DEFAULT_TENANT,
+    tenant: flags.Tenant = DEFAULT_TENANT,
 ) -> Result:
     """Clear the failed attempts of a subject; exit status 1 if there are none.
 
@@ -106,9 +97,7 @@ def unlock(
 def purge(
     *,
     settings: Settings,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Report how many are due; erase none.")
-    ] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Erase nobody.")] = False,
 ) -> Result:
     """Erase subjects whose retention period has ended, and remove expired records.
 
@@ -132,20 +121,16 @@ def purge(
 def template_enrollment(
     *,
     settings: Settings,
-    tenant: Tenant = DEFAULT_TENANT,
+    tenant: flags.Tenant = DEFAULT_TENANT,
     allow: Annotated[
-        bool | None,
-        typer.Option(
-            "--allow/--forbid", help="Unset: show the current setting.", show_default=False
-        ),
+        bool | None, typer.Option("--allow/--forbid", help="Unset: show the current setting.")
     ] = None,
 ) -> Result:
     """Allow or forbid a tenant's clients to enroll templates that they made themselves.
 
     Forbidden by default: with a key for `enroll` and `embeddings` one could enroll a template that
     accepts as many people as it has dimensions. Allow it only if you trust the holders of such keys
-    to say who somebody is. It takes effect at once, in all workers; stored templates stay. An
-    import needs no permission.
+    to say who somebody is. It takes effect at once; stored templates stay.
 
     Example: `veilface db template-enrollment --tenant default --allow`
     """
@@ -162,16 +147,8 @@ def erase_tenant(
     tenant: Annotated[str, typer.Argument(help="The tenant's name.")],
     *,
     settings: Settings,
-    confirm: Annotated[
-        str,
-        typer.Option(
-            help="The name of the tenant again, since this cannot be undone.", show_default=False
-        ),
-    ],
-    out: Annotated[
-        Path | None,
-        typer.Option(help="File for the receipt. Unset: it goes to stdout."),
-    ] = None,
+    confirm: Annotated[str, typer.Option(help="The name again, since this cannot be undone.")],
+    out: Annotated[Path | None, typer.Option(help="File for the receipt. Unset: stdout.")] = None,
 ) -> Result:
     """Erase a tenant: its subjects, templates, keys and rotation; write a signed receipt.
 

@@ -6,7 +6,8 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from api.cli.bulk import BULK, Aligned, Bulk, Cache, Exclude, Flip, Like
+from api.cli import flags
+from api.cli.bulk import BULK, Bulk
 from api.cli.console import demo_notice, message
 from api.cli.errors import CommandError, UsageError
 from api.cli.files import read_names
@@ -23,11 +24,6 @@ from verify.preparation import LikeSample, acquired, acquired_json, make_generat
 app = typer.Typer(no_args_is_help=True)
 
 
-@app.callback()
-def decoys() -> None:
-    """Make the decoys that hide an embedding inside its private template."""
-
-
 @app.command()
 @reports(*BULK)
 def build(
@@ -37,7 +33,7 @@ def build(
     ],
     *,
     settings: Settings,
-    like: Like = None,
+    like: flags.Like = None,
     out: Annotated[
         Path | None, typer.Option(help="The file. Unset: `decoys.veil` in `data_dir`.")
     ] = None,
@@ -48,13 +44,13 @@ def build(
             "it. `pool`: the real embeddings, sealed; for hybrid+ and to reproduce the paper."
         ),
     ] = "generator",
-    exclude: Exclude = None,
+    exclude: flags.Exclude = None,
     limit: Annotated[
         int | None, typer.Option(min=1, help="Take this many photos of SOURCE, spread over it.")
     ] = None,
-    aligned: Aligned = False,
-    flip: Flip = False,
-    cache: Cache = None,
+    aligned: flags.Aligned = False,
+    flip: flags.Flip = False,
+    cache: flags.Cache = None,
 ) -> Result:
     """Make the lifting database from folders of face photos.
 

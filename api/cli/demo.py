@@ -23,18 +23,11 @@ def demo(
         Path, typer.Option(help="Folder for the data; replaces an earlier demo there.")
     ] = Path("demo-data"),
     pack: Annotated[
-        Path | None,
-        typer.Option(
-            help="A real model pack, with --faces. Unset: a model that is built here and "
-            "recognises only cartoon faces."
-        ),
+        Path | None, typer.Option(help="A real model pack. Unset: one that knows cartoons only.")
     ] = None,
     faces: Annotated[
         Path | None,
-        typer.Option(
-            help="Real faces, one subfolder for each person; 8 people need 5 photos each, and the "
-            "others serve as decoys and for the calibration."
-        ),
+        typer.Option(help="Real faces, a subfolder a person; of 8 people 5 photos or more."),
     ] = None,
     dim: Annotated[int, typer.Option(min=1, max=128, help="Dimension m of the templates.")] = 16,
 ) -> Result:
@@ -59,15 +52,14 @@ def demo(
 
 def _text(outcome: Outcome) -> list[str | Table]:
     notice = [DEMO_NOTICE] if outcome.demo_model else []
-    suffix = "".join(f"  ({one})" for one in notice)
     tables = {
-        f"Who was accepted, at level {outcome.level}{suffix}": outcome.people,
-        f"What is stored: {outcome.strategy}{suffix}": outcome.stored,
+        f"Who was accepted, at level {outcome.level}": outcome.people,
+        f"What is stored: {outcome.strategy}": outcome.stored,
     }
     folder = outcome.folder
     text: list[str | Table] = [f"\n{one}\n" for one in notice]
     for title, records in tables.items():
-        text += shown_facts(list(records), title)
+        text += shown_facts(list(records), "  ".join([title, *(f"({one})" for one in notice)]))
     text += [f"Not usable, counted as rejected: {refusal}" for refusal in outcome.refused_photos]
     if outcome.receipt:
         text.append(
@@ -78,9 +70,7 @@ def _text(outcome: Outcome) -> list[str | Table]:
     text.append(
         f"\nDone in {outcome.seconds:.0f} s. Start the service on the same data:\n\n"
         f"  {_program()} serve --config {folder}/veilface.toml\n\n"
-        "and open http://127.0.0.1:8421/ with the API key, which is in a file that only you can "
-        f"read:\n\n  cat {folder}/api-key\n\n"
-        "or ask it, in another terminal:\n\n"
+        "and open http://127.0.0.1:8421/ with the API key, or ask it, in another terminal:\n\n"
         f'  curl -H "Authorization: Bearer $(cat {folder}/api-key)" '
         "http://127.0.0.1:8421/v1/subjects\n"
     )

@@ -15,10 +15,7 @@ from typer.core import TyperGroup
 from api.cli.console import drop_unwritten, message
 from templates.errors import VeilfaceError
 
-FAILED = 1
-USAGE = 2
-NO_DECISION = 3
-_FAILED_STATUS = {"verify": NO_DECISION}  # where 1 is an answer
+FAILED, USAGE, NO_DECISION = 1, 2, 3
 EXTRAS = {
     "evaluate": ("matplotlib", "numba", "pandas", "scipy"),
     "audit": ("matplotlib", "sklearn"),
@@ -50,7 +47,7 @@ class Commands(TyperGroup):
         except Exception as error:
             message(f"error: {sentence(error)}")
             drop_unwritten()
-            failed = _FAILED_STATUS.get(ctx.invoked_subcommand, FAILED)
+            failed = NO_DECISION if ctx.invoked_subcommand == "verify" else FAILED
             raise typer.Exit(USAGE if isinstance(error, UsageError) else failed) from None
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:

@@ -7,17 +7,8 @@ from typing import Annotated
 
 import typer
 
-from api.cli.bulk import (
-    BULK,
-    Bulk,
-    Cache,
-    Flip,
-    Labels,
-    Seed,
-    listed,
-    listed_numbers,
-    write_document,
-)
+from api.cli import flags
+from api.cli.bulk import BULK, Bulk, listed, listed_numbers, write_document
 from api.cli.console import demo_notice, message, progress
 from api.cli.errors import UsageError, require_extra
 from api.cli.evaluation_inputs import open_all, open_embedder, open_sources
@@ -95,11 +86,11 @@ def evaluate(
     repeats: Annotated[
         int, typer.Option(min=1, help="Repeat all that is random, with seeds from --seed on.")
     ] = 5,
-    seed: Seed = 0,
+    seed: flags.Seed = 0,
     fmr: Annotated[
         str, typer.Option(help="False match rates at which the FNMR is reported.")
     ] = ",".join(f"{target:g}" for target in TARGETS),
-    labels: Labels = None,
+    labels: flags.Labels = None,
     out: Annotated[Path, typer.Option(help="Folder of the results.")] = Path("evaluation"),
     aligned: Annotated[
         bool | None,
@@ -108,8 +99,8 @@ def evaluate(
             help="Whether the photos are aligned crops. Unset: where all have the embedder's size.",
         ),
     ] = None,
-    flip: Flip = False,
-    cache: Cache = None,
+    flip: flags.Flip = False,
+    cache: flags.Cache = None,
     cluster: Annotated[
         str | None,
         typer.Option(help="Scheduler of a Dask cluster, such as `tcp://HOST:PORT`. Unset: here."),
@@ -143,7 +134,9 @@ def evaluate(
         plan = EvaluationPlan(
             strategies=names or default_strategies(decoy_sources),
             dims=listed_numbers(dim, "--dim"),
-            modes=listed(mode, _mode, "--mode", expected=f"a list of {', '.join(MODES)}"),
+            modes=listed(
+                mode, MODES.__getitem__, "--mode", expected=f"a list of {', '.join(MODES)}"
+            ),
             metrics=listed(metric, Metric, "--metric", expected=f"a list of {', '.join(Metric)}"),
             shared_decoys=shared_decoys,
             repeats=repeats,
@@ -189,12 +182,6 @@ def evaluate(
             f"{out}: {', '.join(files)}.",
         ],
     )
-
-
-def _mode(text: str) -> Mode:
-    if text not in MODES:
-        raise ValueError(text)
-    return MODES[text]
 
 
 def _named(file: Path) -> Json:

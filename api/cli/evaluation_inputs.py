@@ -16,8 +16,6 @@ from verify.evaluation.sources import SourceFacts
 from verify.evaluation.verification_set import VerificationSet
 from verify.preparation import recorded_of, require_made_with
 
-NO_PACK = "none"
-
 
 def open_all(datasets: Sequence[Path], *, pictures: bool) -> list[VerificationSet]:
     """Open the sets, whose names must differ."""
@@ -33,7 +31,7 @@ def open_all(datasets: Sequence[Path], *, pictures: bool) -> list[VerificationSe
 
 def open_embedder(bulk: Bulk, embeddings: Path | None, *, aligned: bool | None) -> Embedder:
     """Open the pack, or the file of embeddings."""
-    has_pack = bulk.settings.pack is not None and str(bulk.settings.pack) != NO_PACK
+    has_pack = bulk.settings.pack is not None and str(bulk.settings.pack) != "none"
     if has_pack == (embeddings is not None):
         raise UsageError("give a pack, or `--pack none --embeddings FILE`: the one or the other")
     if embeddings is None:

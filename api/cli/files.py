@@ -3,35 +3,14 @@
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from api.cli.errors import CommandError, UsageError
 from models.decoding import MAX_BYTES
 from models.errors import PhotoRejected
-from models.selection import FacePolicy
-from templates.keys.private_file import read_at_most
+from templates.keys.private_file import read_bounded
 from templates.space.agreement import InconsistentImages
 
 MAX_CONTRACT_BYTES = 2**28
-
-Face = Annotated[
-    FacePolicy,
-    typer.Option(
-        help="Which face counts in a photo of several: `dominant`, the largest if it covers the "
-        "middle and has twice the area of every other; `largest`, wherever it is; `single`, none."
-    ),
-]
-
-
-def read_bounded(path: Path, most: int) -> bytes:
-    """Read a file that has at most ``most`` bytes."""
-    with path.open("rb") as file:
-        data = read_at_most(file, most)
-    if len(data) > most:
-        raise CommandError(f"{path} has more than {most} bytes; is it the right file?")
-    return data
 
 
 def read_photos(paths: Sequence[Path], *, most: int) -> list[bytes]:

@@ -6,20 +6,19 @@ from typing import Annotated, Any
 
 import typer
 
-from api.cli import master_keys
+from api.cli import flags, master_keys
 from api.cli.console import message, progress
 from api.cli.errors import CommandError
-from api.cli.files import read_bounded
-from api.cli.options import STORE, Tenant, reports
+from api.cli.options import STORE, reports
 from api.cli.results import Result
-from api.cli.store import PublicKey, opened_store, read_public_key
+from api.cli.store import opened_store, read_public_key
 from api.http.audit import operator
 from api.http.receipts import verify_answer
 from api.service.opening import open_contract, open_keyring
 from api.settings import DEFAULT_TENANT, Settings
 from templates.contract.canonical import parse_object
 from templates.errors import StoreError
-from templates.keys.private_file import create_private
+from templates.keys.private_file import create_private, read_bounded
 from templates.store.api_keys import ApiKey, Right
 from templates.store.identifiers import utc_now
 from templates.store.receipts import key_fingerprint
@@ -29,12 +28,7 @@ MAX_JSON_BYTES = 2**20
 app = typer.Typer(no_args_is_help=True)
 
 
-@app.callback()
-def keys() -> None:
-    """Create and revoke API keys; rotate keys; verify erasure receipts."""
-
-
-for _command in (master_keys.master, master_keys.rotate, master_keys.rewrap, master_keys.renew):
+for _command in (master_keys.rotate, master_keys.rewrap, master_keys.renew):
     app.command()(_command)
 
 
@@ -43,32 +37,23 @@ for _command in (master_keys.master, master_keys.rotate, master_keys.rewrap, mas
 def create(
     *,
     settings: Settings,
-    right: Annotated[
-        list[Right],
-        typer.Option(help="A right of the key; repeat for several."),
-    ],
+    right: Annotated[list[Right], typer.Option(help="A right of the key; repeat for several.")],
     tenant: Annotated[str, typer.Option(help="Tenant, created if it is new.")] = DEFAULT_TENANT,
     label: Annotated[str, typer.Option(help="What the key is for, as `list` shows it.")] = "",
     days: Annotated[
-        int | None,
-        typer.Option(min=1, max=36500, help="Days until it expires. Unset: never."),
+        int | None, typer.Option(min=1, max=36500, help="Days until it expires. Unset: never.")
     ] = None,
     lowest_level: Annotated[
-        str | None,
-        typer.Option(
-            help="Lowest security level that it may ask for, as `fmr-1e-4`: it verifies at none "
-            "of a larger false match rate. Unset: the setting `lowest_level`."
-        ),
+        str | None, typer.Option(help="Lowest security level that it may ask for, as `fmr-1e-4`.")
     ] = None,
     out: Annotated[
-        Path | None,
-        typer.Option(help="New file for the key, of mode 0600. Unset: it goes to stdout, once."),
+        Path | None, typer.Option(help="New private file for the key. Unset: stdout, once.")
     ] = None,
 ) -> Result:
     """Create an API key and show it once.
 
-    Needs: the database and its master key; the service may run meanwhile. Give a key no more
-    rights than its user needs. `embeddings` and `scores` are the ones an attacker would like.
+    The service may run meanwhile. Give a key no more rights than its user needs: `embeddings` and
+    `scores` are the ones an attacker would like.
 
     Example: `veilface keys create --right enroll --right verify --label web-shop`
     """
@@ -107,10 +92,7 @@ def list_keys(
 @app.command()
 @reports(*STORE)
 def revoke(
-    prefix: Annotated[
-        str,
-        typer.Argument(help="The 12 digits after `vf_`, as in `list`."),
-    ],
+    prefix: Annotated[str, typer.Argument(help="The 12 digits after `vf_`, as in `list`.")],
     *,
     settings: Settings,
 ) -> Result:
@@ -129,29 +111,19 @@ def revoke(
 def rotate_tenant(
     *,
     settings: Settings,
-    tenant: Tenant = DEFAULT_TENANT,
+    tenant: flags.Tenant = DEFAULT_TENANT,
     stolen: Annotated[
-        bool,
-        typer.Option(
-            "--stolen",
-            help="Templates were stolen too: leave them under their old key, and list who must "
-            "be enrolled again.",
-        ),
+        bool, typer.Option("--stolen", help="Templates were stolen too: turn none of them.")
     ] = False,
     finish: Annotated[
-        bool,
-        typer.Option(
-            "--finish", help="Make no new key; go on with a renewal that was interrupted."
-        ),
+        bool, typer.Option("--finish", help="Make no new key; go on with an interrupted renewal.")
     ] = False,
 ) -> Result:
     """Give a tenant a new rotation key, and turn its stored templates by it.
 
-    Needs: the database, the key file and the contract; the service may run meanwhile. Nobody has
-    to enroll again, and the old key is dropped at the end. If templates were stolen too, use
-    `--stolen`: those who must enroll again, with new photos, are listed. `--stolen --finish` shows
-    who is left, and drops the old key when nobody is; `--finish` alone would turn the stolen
-    templates.
+    The service may run meanwhile. Nobody has to enroll again, and the old key is dropped at the
+    end. If templates were stolen too, use `--stolen`: those who must enroll again, with new photos,
+    are listed. `--stolen --finish` shows who is left, and drops the old key when nobody is.
 
     Example: `veilface keys rotate-tenant --tenant default`
     """
@@ -190,7 +162,7 @@ def rotate_tenant(
 def verify_receipt(
     receipt: Annotated[Path, typer.Argument(help="JSON that the DELETE call returned.")],
     *,
-    public_key: PublicKey,
+    public_key: flags.PublicKey,
 ) -> Result:
     """Verify an erasure receipt; exit status 1 if it is not valid.
 
@@ -216,7 +188,5 @@ def _described(key: ApiKey) -> dict[str, Any]:
         state = "revoked"
     else:
         state = "valid" if key.is_valid_at(utc_now()) else "expired"
-    names = ("prefix", "tenant", "lowest_level", "label")
-    times = ("created_at", "expires_at", "revoked_at")
-    facts = {name: getattr(key, name) for name in (*names, *times)}
-    return {**facts, "rights": sorted(key.rights), "state": state}
+    facts = {**vars(key), "rights": sorted(key.rights), "state": state}
+    return {name: value for name, value in facts.items() if name not in ("id", "authentic")}

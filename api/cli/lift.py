@@ -7,9 +7,10 @@ from typing import Annotated
 import numpy as np
 import typer
 
+from api.cli import flags
 from api.cli.console import demo_notice
 from api.cli.errors import CommandError, UsageError
-from api.cli.files import MAX_CONTRACT_BYTES, Face, naming_photo, read_bounded, read_photos
+from api.cli.files import MAX_CONTRACT_BYTES, naming_photo, read_photos
 from api.cli.options import reports
 from api.cli.results import Result, as_json
 from enroll.enroller import MAX_PHOTOS
@@ -18,7 +19,7 @@ from models.errors import ModelError
 from models.selection import FacePolicy
 from templates.contract.canonical import parse_object
 from templates.decoys import DecoyGenerator
-from templates.keys.private_file import replace_private
+from templates.keys.private_file import read_bounded, replace_private
 
 
 @reports()
@@ -48,15 +49,13 @@ def lift(
         int | None,
         typer.Option(help="Dimension of a probe. Unset: the largest that the contract takes."),
     ] = None,
-    face: Face = FacePolicy.DOMINANT,
+    face: flags.Face = FacePolicy.DOMINANT,
 ) -> Result:
     """Make a private template from photos on this machine, without any secret of the service.
 
-    Needs: the service's model pack, and `GET /v1/contract` and `GET /v1/contract/generator` saved
-    to files. Send the result as `{"template": …}` with a key that has the right `embeddings`; to
-    enroll it, the tenant must allow templates (`veilface db template-enrollment`). Never lift the
-    same photo twice for an enrollment: two templates of one embedding give it away. Keep the file
-    like a password.
+    Send the result as `{"template": …}` with a key that has the right `embeddings`; to enroll it,
+    the tenant must allow templates (`veilface db template-enrollment`). Never lift the same photo
+    twice for an enrollment: two templates of one embedding give it away.
 
     Example: `veilface lift me-1.jpg me-2.jpg --pack buffalo_l --generator generator.bin
     --contract contract.json --out me.veil`

@@ -1,14 +1,14 @@
-"""``veilface keys master``, ``rotate``, ``rewrap``, ``renew``: what everything is sealed under."""
+"""``veilface keys rotate``, ``rewrap``, ``renew``: the master key that all is sealed under."""
 
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from api.cli.console import progress
+from api.cli.console import message, progress
 from api.cli.errors import CommandError, UsageError
 from api.cli.options import STORE, reports
-from api.cli.results import Result, shown_facts
+from api.cli.results import Result
 from api.cli.store import opened_store
 from api.http.audit import operator
 from api.service.opening import file_sealer, open_keyring
@@ -19,32 +19,15 @@ from templates.keys.sealing import MasterKeyring
 from templates.store import TemplateStore, count_wrapped, renew_secrets, rewrap_keys
 from templates.store.identifiers import utc_now
 
-Retire = Annotated[
-    bool,
-    typer.Option("--retire", help="Drop the older keys from the file when nothing needs them."),
-]
-
-
-@reports("data_dir", "master_key_file")
-def master(*, settings: Settings) -> Result:
-    """Create the master key file; an existing one is never touched.
-
-    `serve` and `calibrate` create it on their first run. Keep a copy in a safe place, apart from
-    the database backups: without it nothing stored can be read, and with it everything.
-
-    Example: `veilface keys master --master-key-file /etc/veilface/master.key`
-    """
-    path = settings.resolved_master_key_file
-    return Result({"file": path, "key_id": MasterKeyring.create(path).current})
+Retire = Annotated[bool, typer.Option("--retire", help="Drop the older keys from the file.")]
 
 
 @reports(*STORE)
 def rotate(*, settings: Settings, retire: Retire = False) -> Result:
     """Put a new master key in force and rewrap everything under it.
 
-    Needs: the database, the key file, and the contract and decoys files that it sealed. The
-    service may run meanwhile; it rereads the key file. Templates are not touched, only the keys
-    that wrap them. Earlier backups need the old keys: keep those with them.
+    The service may run meanwhile; it rereads the key file. Templates are not touched, only the keys
+    that wrap them, and contract and decoys files. Earlier backups need the old keys.
 
     Example: `veilface keys rotate --retire`
     """
@@ -76,11 +59,10 @@ def renew(
 ) -> Result:
     """Renew every secret of the deployment, after its database and master key were stolen.
 
-    Stop the service first, and start it again afterwards. Puts a new master key in force and drops
-    the old one; moves the audit log into a signed archive; renews the keys of receipts, exports,
-    API keys and the audit log, and every tenant's rotation key. Then lists who must enroll again,
-    and which API keys to make anew. If the master keys do not come from a file, put a new one in
-    front at their source first, and drop the old one afterwards.
+    Stop the service first, and start it again afterwards. Renews the master key, the keys of
+    receipts, exports, API keys and the audit log, and every tenant's rotation key; moves the audit
+    log into a signed archive. Then lists who must enroll again, and which API keys to make anew. If
+    the master keys do not come from a file, put a new one in front at their source first.
 
     Example: `veilface keys renew audit-before-theft.jsonl`
     """
@@ -109,20 +91,13 @@ def renew(
                 key.prefix for key in store.api_keys.all() if key.is_valid_at(utc_now())
             ],
         }
-    left = [
-        "- Keep the anchor of the audit log elsewhere.",
-        "- Give everybody who verifies receipts `GET /v1/contract` anew: it names the new key.",
-        "- Enroll the subjects above again, with new photos. Then run for each tenant",
-        *(
-            f"    veilface keys rotate-tenant --tenant {name} --stolen --finish"
-            for name in enroll_again
-        ),
-        "- Make a new API key for each of those above (`veilface keys create`), hand it over, and",
-        *(f"    veilface keys revoke {prefix}" for prefix in facts["replace_api_keys"]),
-        "- Make another export key file, if there is one, and drop older master keys that are in",
-        "  no file. Destroy copies of the old master key: it opens backups from before.",
-    ]
-    return Result(facts, [*shown_facts(facts), "\nLeft to do:", *left])
+    message(
+        'Left to do: docs/deploy.md, "Renewing every secret". Keep the anchor elsewhere, give '
+        "`GET /v1/contract` anew to all who verify receipts, replace the API keys above, and "
+        "enroll those subjects again with new photos; then, for each tenant, `veilface keys "
+        "rotate-tenant --stolen --finish`. Destroy copies of the old master key."
+    )
+    return Result(facts)
 
 
 def _require_file(settings: Settings, remedy: str) -> None:

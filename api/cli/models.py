@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from api.cli.console import counted, demo_notice, message
+from api.cli.console import demo_notice, message
 from api.cli.errors import CommandError, UsageError
 from api.cli.options import reports
 from api.cli.pack_download import obtained, shown
@@ -25,19 +25,12 @@ NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,63}")
 app = typer.Typer(no_args_is_help=True)
 
 
-@app.callback()
-def models() -> None:
-    """Fetch and inspect model packs (the weights you supply)."""
-
-
 @app.command()
 @reports()
 def fetch(
     name: Annotated[
         str,
-        typer.Argument(
-            help=f"Name of the pack, and of its folder. Known: {', '.join(KNOWN_PACKS)}."
-        ),
+        typer.Argument(help=f"Name of the pack and its folder. Known: {', '.join(KNOWN_PACKS)}."),
     ],
     *,
     sources: Annotated[
@@ -45,15 +38,11 @@ def fetch(
         typer.Option(
             "--from",
             metavar="URL",
-            help="Address of a zip archive or an .onnx file, or a file of this machine; repeat for "
-            "a detector and an embedder that come apart.",
+            help="Address or path of a zip archive or an .onnx file; repeat for several.",
         ),
     ] = None,
     sha256: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="What the file must hash to, in hex; once for each --from, in the same order."
-        ),
+        list[str] | None, typer.Option(help="What it must hash to, in hex; once for each --from.")
     ] = None,
     into: Annotated[Path, typer.Option(help="Folder of the packs.")] = Path("packs"),
     preprocessing: Annotated[
@@ -71,20 +60,18 @@ def fetch(
 ) -> Result:
     """Fetch a pack from an address that you name, and check that it can be used.
 
-    Shows licence and size first, then the SHA-256. Of an archive only `.onnx` files and `pack.toml`
-    are unpacked. Exit status 1: the pack cannot be fetched or used, and nothing of it is left.
+    Of an archive only `.onnx` files and `pack.toml` are unpacked. Exit status 1: the pack cannot be
+    fetched or used, and nothing of it is left.
 
     Example: `veilface models fetch buffalo_sc --from https://example.org/buffalo_sc.zip`
     """
     if not NAME.fullmatch(name):
         raise UsageError("a pack's name has letters, digits, and . _ - inside, 64 at most")
     target = into / name
-    known = KNOWN_PACKS.get(name.lower())
-    message(
-        f"{name}: not a pack that Veilface knows; its licence is between you and its owner."
-        if known is None
-        else f"{name}: {known.contents}; licence: {known.licence}."
-    )
+    if known := KNOWN_PACKS.get(name.lower()):
+        message(f"{name}: {known.contents}; licence: {known.licence}.")
+    else:
+        message(f"{name}: not a pack that Veilface knows; its licence is yours to read.")
     if not sources:
         raise UsageError(
             f"name an address or a file with --from; or put the .onnx files into {target} yourself"
@@ -106,7 +93,7 @@ def fetch(
             digests[shown(source)] = digest
             message(f"{shown(source)}: SHA-256 {digest}")
             if left_out:
-                message(f"Left in the archive: {counted(left_out, 'file')}.")
+                message(f"Left in the archive: {left_out} files.")
         if preprocessing is not None:
             if (folder / FILE_NAME).exists():
                 raise UsageError(f"the archive has a {FILE_NAME}: leave out --preprocessing")
@@ -120,14 +107,10 @@ def fetch(
 @app.command()
 @reports()
 def inspect(
-    pack: Annotated[
-        Path,
-        typer.Argument(help="Folder of .onnx files, or one embedder file."),
-    ],
+    pack: Annotated[Path, typer.Argument(help="Folder of .onnx files, or one embedder file.")],
 ) -> Result:
     """Show what each graph of a pack is, and whether Veilface can use the pack.
 
-    Needs: a folder of `.onnx` files such as InsightFace's `buffalo_l`, or one `.onnx` embedder.
     Exit status 1 means that the pack cannot be used; the reason is shown.
 
     Example: `veilface models inspect ~/.insightface/models/buffalo_l`
@@ -145,12 +128,9 @@ def inspect(
 
 def usable(info: PackInfo) -> str:
     """Say what a pack gives, and what it takes."""
-    detector = (
-        "no detector: photos must be aligned square crops"
-        if info.detector is None
-        else f"detector {info.detector.kind}"
-    )
-    return f"{info.n} numbers per embedding, {detector}."
+    if info.detector is None:
+        return f"{info.n} numbers per embedding, no detector: photos must be aligned square crops."
+    return f"{info.n} numbers per embedding, detector {info.detector.kind}."
 
 
 def _described(pack: ModelPack) -> dict[str, Any]:

@@ -22,14 +22,6 @@ from api.settings import CONFIG_VARIABLE, ENV_PREFIX, Settings, load_settings
 
 STORE = ("data_dir", "database_url", "master_key_file", "master_key_variable")
 
-Tenant = Annotated[str, typer.Option(help="Tenant.")]
-Device = Annotated[
-    str,
-    typer.Option(
-        help="Where distances in float32 are computed: `cpu`, or a device of torch such as `cuda` "
-        "(extra `torch`)."
-    ),
-]
 PROCESSOR = "cpu"
 
 
@@ -80,27 +72,24 @@ def reports(*settings: str) -> Callable[[Callable[..., Result | None]], Callable
     return decorate
 
 
-def _option(name: str, default: Any, annotation: Any) -> inspect.Parameter:
+def _option(name: str, default: Any, kind: Any, *flags: str, **more: Any) -> inspect.Parameter:
     return inspect.Parameter(
-        name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation
+        name,
+        inspect.Parameter.KEYWORD_ONLY,
+        default=default,
+        annotation=Annotated[kind, typer.Option(*flags, **more)],
     )
 
 
 _AS_JSON = _option(
-    "as_json",
-    False,
-    Annotated[bool, typer.Option("--json", help="Write JSON to stdout; messages stay on stderr.")],
+    "as_json", False, bool, "--json", help="Write JSON to stdout; messages stay on stderr."
 )
 _CONFIG = _option(
     "config",
     None,
-    Annotated[
-        Path | None,
-        typer.Option(
-            help=f"TOML file with settings. Unset: `{CONFIG_VARIABLE}`, then `veilface.toml`.",
-            rich_help_panel="Settings",
-        ),
-    ],
+    Path | None,
+    help=f"TOML file with settings. Unset: `{CONFIG_VARIABLE}`, then `veilface.toml`.",
+    rich_help_panel="Settings",
 )
 _KINDS: dict[Any, Any] = {Path | None: Path, int | None: int}
 _KINDS |= {kind: kind for kind in (Path, int, float, bool)}
@@ -113,12 +102,14 @@ def _flag(name: str, declared: FieldInfo) -> inspect.Parameter:
     shown = "" if default is None else f" Default: `{default}`."
     flag = name.replace("_", "-")
     kind = _KINDS.get(declared.annotation, str)
-    option = typer.Option(
+    return _option(
+        name,
+        None,
+        kind | None,
         f"--{flag}/--no-{flag}" if kind is bool else f"--{flag}",
         help=f"{declared.description}{shown} Variable: `{ENV_PREFIX}{name.upper()}`.",
         rich_help_panel="Settings",
     )
-    return _option(name, None, Annotated[kind | None, option])
 
 
 def _read_plan(ctx: typer.Context, file: Path | None) -> Path | None:
@@ -130,15 +121,14 @@ def _read_plan(ctx: typer.Context, file: Path | None) -> Path | None:
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise UsageError(f"--plan {file} cannot be read as TOML: {error}") from None
     names = {
-        flag.lstrip("-").replace("-", "_"): str(parameter.name)
+        flag.lstrip("-"): str(parameter.name)
         for parameter in ctx.command.params
         for flag in (*parameter.opts, str(parameter.name))
         if "--plan" not in parameter.opts
     }
-    chosen = {name.replace("-", "_"): value for name, value in values.items()}
-    if unknown := sorted(chosen.keys() - names.keys()):
+    if unknown := sorted(values.keys() - names.keys()):
         raise UsageError(f"--plan {file} names no option of this command: {', '.join(unknown)}")
-    ctx.default_map = {names[name]: value for name, value in chosen.items()}
+    ctx.default_map = {names[name]: value for name, value in values.items()}
     return file
 
 

@@ -10,7 +10,6 @@ from api.cli.errors import CommandError, UsageError
 from verify import LabelledFolder, labelled_folder
 from verify.datasets import SUFFIXES, distinct_files, is_photo, photos_alone, visible
 
-_MOST_NAMED = 5
 _ENDINGS = ", ".join(sorted(SUFFIXES))
 
 
@@ -112,10 +111,6 @@ def _files_below(folder: Path) -> Iterator[Path]:
 
 def _note_unread(folder: Path, others: Sequence[str], *, copies: int) -> None:
     if others:
-        more = ", …" if len(others) > _MOST_NAMED else ""
-        message(
-            f"note: not read in {folder}: {', '.join(others[:_MOST_NAMED])}{more} ({len(others):,} "
-            f"in all; photos end in {_ENDINGS})"
-        )
+        message(f"note: not read in {folder}: {len(others):,} files, as {others[0]}")
     if copies:
         message(f"note: copies of another photo in {folder} do not count: {copies:,}")

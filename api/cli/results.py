@@ -27,24 +27,13 @@ class Table:
 class Result:
     """What a command found.
 
-    Parameters
-    ----------
-    facts
-        What ``--json`` writes: a mapping, a list or a dataclass. It may hold paths, times, and
-        objects with a method ``to_json``.
-    text
-        What a person reads instead: lines and tables, in order. None: the facts, a line for each
-        value and a table for each list of records.
-    error
-        What is wrong, on stderr after either; the exit status is then 1.
-    status
-        Exit status where nothing is wrong: 1 for a negative answer.
+    ``facts`` may hold paths, times, and objects with a method ``to_json``.
     """
 
-    facts: Any
-    text: str | Sequence[str | Table] | None = None
-    error: str | None = None
-    status: int = 0
+    facts: Any  # what --json writes: a mapping, a list or a dataclass
+    text: str | Sequence[str | Table] | None = None  # what a person reads; None: the facts
+    error: str | None = None  # what is wrong, on stderr after either; the exit status is then 1
+    status: int = 0  # exit status where nothing is wrong: 1 for a negative answer
 
 
 def as_json(value: Any) -> str:

@@ -55,14 +55,12 @@ def assign_roles(
 ) -> Roles:
     """Give every photo one role, where people are labelled."""
     names, left_out = frozenset(labelled.identities), 0
+    sample, calibration = ([], labelled) if like else split_people(labelled)
     if like:
         sample, left_out = photos_of(like, names)
-        calibration = labelled
         names |= {path.parent.name for path in sample if path.parent not in like}
         if not sample:
             raise CommandError("everybody in --like is in PEOPLE too; name folders of others")
-    else:
-        sample, calibration = split_people(labelled)
     kept, more = _others(faces, names, [*labelled.paths, *sample])
     if not kept:
         raise CommandError("everybody in --faces is in PEOPLE or --like; name folders of others")

@@ -41,10 +41,9 @@ def serve(
 ) -> None:
     """Start the REST service.
 
-    Needs: a contract file (from `veilface calibrate`), and to accept photos also the model pack and
-    the decoys file of that contract. The database is created or migrated first. API keys
-    come from `veilface setup` or `veilface keys create`. Stop with Ctrl-C or SIGTERM; requests in
-    progress are finished.
+    Needs what `veilface setup` or `calibrate` made, and to accept photos the model pack. The
+    database is created or migrated first. API keys come from `setup` or `veilface keys create`.
+    Stop with Ctrl-C or SIGTERM; requests in progress are finished.
 
     Example: `veilface serve --pack buffalo_l --data-dir veilface-data --workers 2`
     """

@@ -7,18 +7,18 @@ the contract is written, so that a run that was stopped goes on.
 import shlex
 from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from sqlalchemy.engine import make_url
 
-from api.cli.bulk import Aligned, Bulk, Flip, Like, each_person_once
-from api.cli.calibrate import suspicious_lines
-from api.cli.calibration import calibrate_folder, default_probe_dims
+from api.cli import flags
+from api.cli.bulk import Bulk, each_person_once
+from api.cli.calibrate import MOST_SHOWN
+from api.cli.calibration import DEFAULT_PROBE_DIM, calibrate_folder
 from api.cli.console import demo_notice, message, share_done
 from api.cli.decoys import like_sample
 from api.cli.errors import CommandError, UsageError
-from api.cli.files import read_bounded
 from api.cli.models import usable
 from api.cli.options import reports
 from api.cli.photo_folders import find_photos, labelled_people
@@ -32,7 +32,7 @@ from api.settings import DEFAULT_CONFIG_FILE, DEFAULT_TENANT, Settings, config_f
 from models.extraction import Extraction
 from templates.contract.document import Contract
 from templates.decoys import DecoyGenerator
-from templates.keys.private_file import replace_private, replace_public
+from templates.keys.private_file import read_bounded, replace_private, replace_public
 from templates.space.lifting import Strategy
 from templates.store.api_keys import Right
 from verify import CalibrationOptions
@@ -42,7 +42,6 @@ from verify.preparation import SAME_PHOTO, acquired, make_generator
 
 RIGHTS = (Right.ENROLL, Right.VERIFY, Right.ERASE, Right.SCORES, Right.ADMIN)
 """Of the key that is made: all that the page shows, with distances, locks and the audit log."""
-HEADER = "Written by `veilface setup`; docs/settings.md has the rest."
 
 
 @reports("pack", "providers", "data_dir", "master_key_file")
@@ -60,21 +59,20 @@ def setup(
         list[Path],
         typer.Option(help="Folder of photos of many other faces: decoys are fitted to them."),
     ],
-    like: Like = None,
-    aligned: Aligned = False,
-    flip: Flip = False,
+    like: flags.Like = None,
+    aligned: flags.Aligned = False,
+    flip: flags.Flip = False,
 ) -> Result:
     """Prepare a service from a model pack and folders of photos, and judge it.
 
-    With --faces alone nobody has to be labelled. Thresholds then assume that users look like those
-    faces, and how many genuine photos are rejected is not measured. The same holds where PEOPLE are
-    too few for any threshold.
+    With --faces alone, or with too few PEOPLE, thresholds assume that users look like those faces,
+    and how many genuine photos are rejected is not measured.
 
-    Makes the master key apart from the data, splits the people by the names of their folders so
-    that no name is in two roles, builds the decoys, calibrates, makes an API key, and writes
-    `veilface.toml`, which `veilface serve` reads. What is there already is kept, so a run that was
-    stopped goes on. The service starts whatever the verdict at the end. Exit status 1: --faces are
-    too few; or a settings file that is there has `serve` start another service.
+    Makes the master key apart from the data, gives every person one role, builds the decoys,
+    calibrates, makes an API key, and writes `veilface.toml`, which `veilface serve` reads. What is
+    there already is kept, so a run that was stopped goes on. The service starts whatever the
+    verdict at the end. Exit status 1: --faces are too few; or there is a settings file with which
+    `serve` would start another service.
 
     Example: `veilface setup --faces fairface/train --pack buffalo_l`
     """
@@ -83,14 +81,15 @@ def setup(
     pack = bulk.pack
     written = _settings_to_write(settings)
     roles = _roles(people, faces, like or [])
-    adapted = f", adapted to {len(roles.sample):,} photos" if roles.sample else ""
-    aside = f"; {roles.left_out:,} photos of people in another role left out"
+    counts = {
+        "people": roles.calibration.people,
+        "photos": len(roles.calibration),
+        "faces": len(roles.faces),
+        "sample": len(roles.sample),
+        "left_out": roles.left_out,
+    }
     message(f"... pack: {pack.info.name}, {usable(pack.info)}")
-    message(
-        f"... roles: decoys of {len(roles.faces):,} faces{adapted}; thresholds on "
-        f"{roles.calibration.people:,} people, {len(roles.calibration):,} photos"
-        f"{aside if roles.left_out else ''}"
-    )
+    message("... roles: " + ", ".join(f"{role} {count}" for role, count in counts.items()))
     # On whom a contract was judged that is kept, this call's arguments do not say.
     strangers = not (roles.is_labelled or settings.resolved_contract_file.exists())
     contract = _contract(roles, bulk, like or [])
@@ -104,11 +103,7 @@ def setup(
     return Result(
         {
             "labelled": roles.is_labelled,
-            "people": roles.calibration.people,
-            "photos": len(roles.calibration),
-            "faces": len(roles.faces),
-            "sample": len(roles.sample),
-            "left_out": roles.left_out,
+            **counts,
             "data_dir": settings.data_dir,
             "api_key_file": key_file,
             "settings_file": config_file(),
@@ -130,33 +125,26 @@ def _settings_to_write(settings: Settings) -> str | None:
     One with which `serve` would start another service is refused.
     """
     names = ["data_dir", "pack"]
-    names += [
-        name for name in ("master_key_file", "providers") if name in settings.model_fields_set
-    ]
-    if settings.database_url is not None:
-        if make_url(settings.database_url).password is None:
-            names.append("database_url")
-        else:
-            message(
-                "note: the database's URL has a password, and is in no file: give it to `serve`"
-            )
-    text = settings_text({name: getattr(settings, name) for name in names}, HEADER)
-    if (file := config_file()) is None:
+    names += [one for one in ("master_key_file", "providers") if one in settings.model_fields_set]
+    if settings.database_url is not None and make_url(settings.database_url).password is None:
+        names.append("database_url")
+    elif settings.database_url is not None:
+        message("note: the database's URL has a password, and is in no file: give it to `serve`")
+    text, file = _text_of(settings, names), config_file()
+    if file is None:
         return text
-    served = load_settings()
-    other = [name for name in names if _in_full(served, name) != _in_full(settings, name)]
-    if other:
+    if _text_of(load_settings(), names) != text:
         raise CommandError(
-            f"{file} is there, and says something else of {', '.join(other)}, so that `veilface "
-            f"serve` would start another service; it should say\n{text}"
+            f"{file} is there, and with it `veilface serve` would start another service; it should "
+            f"say\n{text}"
         )
     message(f"... settings: {file} is there and kept")
     return None
 
 
-def _in_full(settings: Settings, name: str) -> Any:
-    value = getattr(settings, name)
-    return value.absolute() if isinstance(value, Path) else value
+def _text_of(settings: Settings, names: Sequence[str]) -> str:
+    values = {name: getattr(settings, name) for name in names}
+    return settings_text(values, "Written by `veilface setup`; docs/settings.md has the rest.")
 
 
 def _roles(people: Path | None, faces: Sequence[Path], like: Sequence[Path]) -> Roles:
@@ -241,12 +229,11 @@ def _contract(roles: Roles, bulk: Bulk, like: Sequence[Path]) -> Contract:
             pack=bulk.pack,
             source=source,
             strategy=Strategy.ADVERSARIAL,
-            options=CalibrationOptions(probe_dims=(0, *default_probe_dims(None))),
-            progress=lambda _what, share: report(share),
+            options=CalibrationOptions(probe_dims=(0, DEFAULT_PROBE_DIM)),
+            progress=report,
         )
-    if roles.is_labelled:
-        for line in suspicious_lines(done.report):
-            message(line)
+    for pair in done.report.suspicious[:MOST_SHOWN]:
+        message(f"note: {pair.first} and {pair.second} look alike: put one person into one folder")
     if fitted is not None:
         fitted.save(decoys)
     done.contract.save(path, sealer)
@@ -292,13 +279,12 @@ def kept_api_key(settings: Settings) -> Path:
     """
     file = settings.resolved_master_key_file.parent / "api-key"
     with opened_store(settings) as store:
-        is_there = file.exists()
-        token = read_bounded(file, 4096).decode("ascii", "replace").strip() if is_there else ""
+        is_kept = _is_kept("API key", file)
+        token = read_bounded(file, 4096).decode("ascii", "replace").strip() if is_kept else ""
         if store.api_keys.verify(token) is not None:
-            message(f"... API key: {file} is there and kept")
             return file
-        why = f"the store does not take the one of {file}: making another"
-        message(f"... API key: {why if is_there else f'making {file}'}")
+        if is_kept:
+            message(f"... API key: the store does not take the one of {file}: making another")
         store.tenants.create(DEFAULT_TENANT)
         new = store.api_keys.create(DEFAULT_TENANT, RIGHTS, label="setup", by=operator())
         replace_private(file, f"{new.token}\n".encode())

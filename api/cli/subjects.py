@@ -1,17 +1,18 @@
 """``veilface enroll`` and ``veilface verify``: on this machine, against the store itself."""
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from api.cli.console import counted, demo_notice, message, progress
+from api.cli import flags
+from api.cli.console import demo_notice, message, progress
 from api.cli.errors import CommandError, UsageError, sentence
-from api.cli.files import Face, naming_photo, read_photos
-from api.cli.options import STORE, Tenant, reports
+from api.cli.files import naming_photo, read_photos
+from api.cli.options import STORE, reports
 from api.cli.photo_folders import albums_of
 from api.cli.results import Result, Table
 from api.http.audit import operator
@@ -34,12 +35,9 @@ LOCAL = (*STORE, "pack", "providers", "onnx_threads")
 
 @reports(*LOCAL)
 def enroll(
-    subject: Annotated[
-        str | None, typer.Argument(help="Id of the person.", show_default=False)
-    ] = None,
+    subject: Annotated[str | None, typer.Argument(help="Id of the person.")] = None,
     photos: Annotated[
-        list[Path] | None,
-        typer.Argument(help=f"1 to {MAX_PHOTOS} photos of that person.", show_default=False),
+        list[Path] | None, typer.Argument(help=f"1 to {MAX_PHOTOS} photos of that person.")
     ] = None,
     *,
     settings: Settings,
@@ -49,19 +47,17 @@ def enroll(
             "--from",
             metavar="PEOPLE",
             help="Enroll many: a folder with a subfolder of photos for each person, whose name is "
-            "the id, or a CSV file `subject,photo`, with paths relative to it. At most "
-            f"{MAX_PHOTOS} photos of each are taken.",
+            "the id, or a CSV file `subject,photo`, with paths relative to it.",
         ),
     ] = None,
-    tenant: Tenant = DEFAULT_TENANT,
-    face: Face = FacePolicy.DOMINANT,
+    tenant: flags.Tenant = DEFAULT_TENANT,
+    face: flags.Face = FacePolicy.DOMINANT,
 ) -> Result:
     """Enroll a person from photos, or replace their enrollment; or enroll many with --from.
 
-    Needs: what `serve` needs (contract, decoys, pack); the service may run meanwhile. Three photos
-    are better than one. Only the private template is stored. Under a hybrid+ contract enroll over
-    REST, which takes the attributes. With --from, exit status 1 means that somebody was not
-    enrolled; the others are.
+    Needs what `serve` needs; the service may run meanwhile. Three photos are better than one. Under
+    a hybrid+ contract enroll over REST, which takes the attributes. With --from, exit status 1
+    means that somebody was not enrolled; the others are.
 
     Example: `veilface enroll alice alice-1.jpg alice-2.jpg alice-3.jpg --pack buffalo_l`
     """
@@ -114,16 +110,13 @@ class _Entrance:
 @contextmanager
 def _opened(settings: Settings, tenant: str) -> Iterator[_Entrance]:
     """Open the deployment; only the default tenant is made where it is missing."""
-    runtime = Runtime.open(settings)
-    try:
+    with closing(Runtime.open(settings)) as runtime:
         prepare_database(runtime.store)
         if runtime.pack is None:
             raise UsageError("photos need a model pack; name it with --pack")
         tenants = runtime.store.tenants
         known = tenants.create(tenant) if tenant == DEFAULT_TENANT else tenants.get(tenant)
         yield _Entrance(runtime, runtime.pack, known.name)
-    finally:
-        runtime.close()
 
 
 def _enroll_all(
@@ -148,9 +141,11 @@ def _enroll_all(
                 if isinstance(error, StoreUnavailable) and not isinstance(error, StoreBusy):
                     outage = failed[subject]
             advance(1)
-    used = counted(sum(one["photos"] for one in enrolled), "photo")
+    used = sum(one["photos"] for one in enrolled)
     people = len(enrolled) + len(failed)
-    report: list[str | Table] = [f"Enrolled {len(enrolled):,} of {people:,} people, from {used}."]
+    report: list[str | Table] = [
+        f"Enrolled {len(enrolled):,} of {people:,} people, from {used:,} photos."
+    ]
     if failed:
         several = "A photo that shows several faces may be taken with --face largest."
         report[:0] = [Table("Not enrolled", ("person", "why"), [*failed.items()]), several]
@@ -169,40 +164,30 @@ def _enroll_all(
 @reports(*LOCAL)
 def verify(
     subject: Annotated[str, typer.Argument(help="Id of the person.")],
-    photos: Annotated[
-        list[Path],
-        typer.Argument(
-            help=f"1 to {MAX_PROBE_PHOTOS} photos to check, of one person.", show_default=False
-        ),
-    ],
+    photos: Annotated[list[Path], typer.Argument(help=f"1 to {MAX_PROBE_PHOTOS} photos to check.")],
     *,
     settings: Settings,
     level: Annotated[
-        str | None,
-        typer.Option(
-            help="Security level, not below the setting `lowest_level`. Unset: the contract's "
-            "default."
-        ),
+        str | None, typer.Option(help="Security level. Unset: the contract's default.")
     ] = None,
-    tenant: Tenant = DEFAULT_TENANT,
-    face: Face = FacePolicy.DOMINANT,
+    tenant: flags.Tenant = DEFAULT_TENANT,
+    face: flags.Face = FacePolicy.DOMINANT,
 ) -> Result:
     """Check whether photos show a person; exit status 0 if accepted, 1 if rejected.
 
-    Several photos are averaged, which rejects the right person less often. Exit status 3 means that
-    no decision was made, and stderr says why. Needs: what `serve` needs; the service may run
-    meanwhile. The decision goes into the audit log; it neither counts towards the subject's lockout
-    nor is stopped by it. It cannot take a holder's key, so it rejects everybody whose enrollment
-    has one.
+    Exit status 3 means that no decision was made, and stderr says why. Needs what `serve` needs;
+    the service may run meanwhile. The decision goes into the audit log; it neither counts towards
+    the subject's lockout nor is stopped by it. It takes no holder's key, so it rejects everybody
+    whose enrollment has one.
 
     Example: `veilface verify alice now-1.jpg now-2.jpg now-3.jpg --pack buffalo_l --level fmr-1e-4`
     """
     data = read_photos(photos, most=MAX_PROBE_PHOTOS)
     with _opened(settings, tenant) as entrance:
-        runtime, pack, name = entrance.runtime, entrance.pack, entrance.tenant
-        read = runtime.read(name, subject)
+        runtime, pack = entrance.runtime, entrance.pack
+        read = runtime.read(entrance.tenant, subject)
         if read is None:
-            raise CommandError(f"nobody is enrolled as {subject!r} in tenant {name}")
+            raise CommandError(f"nobody is enrolled as {subject!r} in tenant {entrance.tenant}")
         template, verifier = read[0], read[1].verifier
         try:
             level = runtime.levels.in_force(level)
@@ -215,10 +200,9 @@ def verify(
         ).with_advice(clear=probe.clear)
         outcome = "accept" if decision.accepted else "reject"
         # Another action than the service's: what an operator tries is not counted by the lockout.
-        pseudonym = runtime.store.signer.pseudonym(name, subject)
-        runtime.store.audit_log.record(
-            Entry("verify-locally", outcome, operator(), name, pseudonym)
-        )
+        pseudonym = runtime.store.signer.pseudonym(entrance.tenant, subject)
+        entry = Entry("verify-locally", outcome, operator(), entrance.tenant, pseudonym)
+        runtime.store.audit_log.record(entry)
     names = ("reason", "level", "fmr", "contract_id", "calibration_id", "advice")
     facts = {name: getattr(decision, name) for name in names}
     return Result(

@@ -7,14 +7,6 @@ from templates.contract.verdict import Judgement, Verdict
 
 _MANY = 0.25
 """From this rate on, tenths are counted: 40 % as 1 in 2 would be wrong by a quarter."""
-_REMEDIES = {
-    "privacy": "To make it private: build the decoys from more photos, of people like these "
-    "(`veilface decoys build … --like PEOPLE`).",
-    "accuracy": "To make it accurate: enroll and verify with more photos; decoys that are more "
-    "like these people allow a smaller dimension.",
-    "groups": "To hold every group of people to the target: calibrate with --worst-group, at "
-    "the price of more false non-matches, on more people of that group.",
-}
 
 
 def shown_rate(rate: Rate) -> str:
@@ -25,15 +17,6 @@ def shown_rate(rate: Rate) -> str:
         f"{100 * rate.value:.3g} % ({rate.errors}/{rate.trials}; "
         f"{100 * rate.ci_low:.2g}-{100 * rate.ci_high:.2g} %)"
     )
-
-
-def improvements(verdict: Verdict) -> list[str]:
-    """Say what would help where a judgement fails."""
-    return [
-        remedy
-        for name, remedy in _REMEDIES.items()
-        if (judged := getattr(verdict, name)) is not None and judged.status == "FAIL"
-    ]
 
 
 def verdict_lines(verdict: Verdict | None) -> list[str]:

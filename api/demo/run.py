@@ -20,7 +20,7 @@ from typing import Any
 
 import httpx
 
-from api.cli.calibration import calibrate_folder, default_probe_dims
+from api.cli.calibration import DEFAULT_PROBE_DIM, calibrate_folder
 from api.demo.people import Cast, Scale, drawn_cast, found_cast
 from api.demo.service import running_service
 from api.demo.storage import KEY_FILE, Stored, create_key, read_stored, rows_of
@@ -167,7 +167,7 @@ def _calibrate(folder: Path, pack_path: Path, cast: Cast, *, m: int, say: Say) -
         axes=generator.k,
         m=m,
         options=CalibrationOptions(
-            photos_per_enrollment=ENROLLED_PHOTOS, probe_dims=(0, *default_probe_dims(m))
+            photos_per_enrollment=ENROLLED_PHOTOS, probe_dims=(0, DEFAULT_PROBE_DIM)
         ),
     )
     keyring = MasterKeyring.create(folder / KEY_FILE)

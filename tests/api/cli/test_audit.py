@@ -15,19 +15,12 @@ from tests.api.cli.audit_bench import (
     VALIDATION,
     are_pictures,
     both,
-    documented,
     draw_fairface,
-    named_in,
 )
 from tests.api.cli.conftest import DIM, Ran, World, run
 from tests.leaks import LeakSearch
 
 pytestmark = pytest.mark.long
-
-BOTH = {
-    *("format", "version", "kind", "passed", "headlines", "comparison_headlines", "limits"),
-    *("verdicts", "model", "settings", "rows", "outcomes", "failure_to_acquire"),
-}
 
 
 @dataclass(frozen=True)
@@ -42,9 +35,6 @@ class FaceAudit:
     @property
     def out(self) -> Path:
         return self.root / "out"
-
-
-FEW = ("--attack", "100", "--attacked", "50")
 
 
 @pytest.fixture(scope="module")
@@ -94,25 +84,6 @@ def test_an_audit_of_faces_writes_report_and_figures(faces: FaceAudit, face_repo
         assert sentence in text
 
 
-def test_the_report_of_faces_is_the_one_that_is_documented(face_report: Any) -> None:
-    members = documented()
-    assert members.keys() >= BOTH
-    missing = members.keys() - face_report.keys()
-    assert missing <= {name for name in members if "`templates`" in members[name]}
-    assert face_report.keys() <= members.keys()
-    assert (face_report["format"], face_report["version"]) == ("veilface audit", 1)
-    assert face_report["kind"] == "fairface"
-    scheme = {"strategy", "decoys", "dim", "axes"}
-    row_names = named_in("A row of attribute inference has")
-    for row in face_report["rows"]:
-        assert row.keys() >= row_names | scheme
-        assert row.keys() <= row_names | scheme
-    outcome_names = named_in("An outcome has")
-    for outcome in face_report["outcomes"]:
-        assert outcome_names <= outcome.keys() | outcome["measured"].keys()
-        assert outcome.keys() <= outcome_names | scheme
-
-
 def test_sizes_and_failures_are_told(faces: FaceAudit, face_report: Any) -> None:
     settings = face_report["settings"]
     assert (settings["lifting"], settings["attack"]) == (100, TRAIN - 1 - 100)
@@ -141,30 +112,6 @@ def test_a_limit_that_is_exceeded_is_status_1(faces: FaceAudit, face_report: Any
         for each in judged
     )
     assert cell["compared"] == far > 0
-
-
-def test_the_seed_gives_the_rows_and_a_kept_limit_is_status_0(
-    faces: FaceAudit, face_report: Any
-) -> None:
-    more = ("--limit", "attribute-leakage=1", "--out", faces.root / "again")
-    again = run(*faces.asked, *more)
-    assert (again.status, again.stderr.count("error")) == (0, 0)
-    assert again.stdout.splitlines()[0] == "PASSED"
-    assert "no attack that was made exceeds its limit" in again.stdout
-    report = json.loads((faces.root / "again" / "report.json").read_text())
-    assert report["rows"] == face_report["rows"]
-    assert report["outcomes"] == face_report["outcomes"]
-    written = {file.name for file in (faces.root / "again").iterdir()}
-    assert written == {"report.json", "report.md", *both(["figure"])}
-
-
-def test_only_the_photos_that_the_limits_ask_for_are_embedded(faces: FaceAudit) -> None:
-    ran = run(*faces.asked, *FEW, "--out", faces.root / "few", "--json")
-    assert ran.status in (0, 1, 3), ran.stderr
-    acquired, settings = ran.json["failure_to_acquire"], ran.json["settings"]
-    assert (acquired["train"]["photos"], acquired["val"]["photos"]) == (200, 50)
-    assert (settings["lifting"], settings["attacked"]) == (100, 50)
-    assert settings["attack"] == 100 - acquired["train"]["failed"]
 
 
 def test_no_descriptor_stands_in_the_report_of_faces(faces: FaceAudit) -> None:

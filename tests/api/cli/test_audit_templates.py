@@ -70,7 +70,6 @@ def people(world: World, tmp_path_factory: pytest.TempPathFactory) -> Iterator[T
     asked: tuple[str | Path, ...] = (
         *("audit", "templates", root / "people", "--pack", world.pack, "--data-dir", world.data),
         *("--aligned", "--cache", root / "people.cache", "--victims", "20", "--owners", "100"),
-        *("--contract", world.data / "contract.json"),
     )
     populations: list[Population] = []
     beds: list[Testbed] = []
@@ -219,64 +218,6 @@ def test_a_contract_of_other_decoys_is_not_served(world: World) -> None:
     rows = np.random.default_rng(0).normal(size=(150, own.n))
     other = DecoyGenerator.fit(rows / np.linalg.norm(rows, axis=1, keepdims=True))
     assert bulk.served_contract(other) is None
-
-
-@pytest.mark.long
-def test_an_attack_that_exceeds_its_limit_is_status_1(
-    people: TemplateAudit, people_report: Any
-) -> None:
-    assert people.first.status == 1
-    (audited,) = people_report["verdicts"]
-    failed = {cell["limit"] for cell in audited["cells"] if cell["status"] == "fail"}
-    assert "success-with-key" in failed
-    assert not people_report["passed"]
-
-
-@pytest.fixture(scope="module")
-def compared(people: TemplateAudit) -> Ran:
-    """The same beside decoys of real people, and with no limit."""
-    return run(*people.asked, *WITHOUT_LIMITS, "--out", people.root / "compared")
-
-
-@pytest.fixture(scope="module")
-def compared_report(people: TemplateAudit, compared: Ran) -> Any:
-    assert "error: " not in compared.stderr, compared.stderr
-    return json.loads((people.root / "compared" / "report.json").read_text(encoding="utf-8"))
-
-
-@pytest.mark.long
-def test_the_seed_gives_the_outcomes_and_kept_limits_are_status_0(
-    people: TemplateAudit, people_report: Any, compared: Ran, compared_report: Any
-) -> None:
-    assert compared.status == 0
-    assert compared.stdout.splitlines()[0] == "PASSED"
-    assert f"{people.root / 'compared'}: report.json, report.md, oracle.png" in compared.stdout
-    found = [row for row in compared_report["outcomes"] if row["decoys"] == "generator"]
-    assert found == people_report["outcomes"]
-
-
-@pytest.mark.long
-def test_pools_are_compared_with_and_do_not_decide(compared: Ran, compared_report: Any) -> None:
-    audited, other = compared_report["verdicts"]
-    assert (audited["decoys"], audited["comparison"]) == ("generator", False)
-    assert (other["decoys"], other["comparison"]) == ("pool", True)
-    known, *_ = [row for row in compared_report["outcomes"] if row["attack"] == "known-pool"]
-    assert known["decoys"] == "pool"
-    assert known["measured"]["ci_low"] > 100 * known["chance"]
-    assert "For comparison: " in compared.stdout
-
-
-@pytest.mark.long
-def test_the_service_of_the_contract_is_audited(people_report: Any, world: World) -> None:
-    settings, known = people_report["settings"], world.calibrated["contract"]
-    assert settings["contract_id"] == known["contract_id"]
-    assert settings["calibration"] == "of the contract"
-    binding = known["binding"]
-    schemes = {(row["strategy"], row["decoys"], row["dim"]) for row in people_report["outcomes"]}
-    assert schemes == {(binding["strategy"], "generator", binding["m"])}
-    levels = {level["name"] for each in known["calibrations"] for level in each["levels"]}
-    levels |= {"fmr-1e-3"}  # a match for second moments, whatever the contract resolves
-    assert {row["level"] for row in people_report["outcomes"]} - {None} <= levels
 
 
 @pytest.mark.long

@@ -25,12 +25,9 @@ FAIRFACE: list[tuple[list[str], str, int]] = [
 TEMPLATES: list[tuple[list[str], str, int]] = [
     (["--limit", "linkability"], "not 'linkability'", 2),
     (["--dim", "16,256", "--axes", "50"], "--dim takes whole numbers from 1 to 49", 2),
-    (["--contract", "CONTRACT", "--dim", "16"], "leave out --strategy, --dim, --axes", 2),
     (["--decoys", "ABSENT"], "absent", 1),
     (["--decoys", "OTHER"], "build the decoys with this pack and the same --flip", 1),
     (["--decoys", "UNSAID"], "build the decoys with this pack and the same --flip", 1),
-    (["--contract", "ABSENT"], "cannot be read (No such file or directory)", 1),
-    (["--contract", "CONTRACT", "--decoys", "OWN"], "use the file that the contract was", 1),
     (["--flip"], "build the decoys with this pack and the same --flip", 1),
 ]
 
@@ -84,15 +81,14 @@ def test_a_wrong_audit_of_faces_is_refused_before_any_face_is_embedded(
 
 
 def write_decoys(world: World, folder: Path) -> dict[str, Path]:
-    """Decoys of another model, of no model that they name, and others of the right one."""
+    """Decoys of another model, and of none that they name."""
     known = DecoyGenerator.load(world.data / "decoys.veil")
     stream = Keystream.seeded("decoys of a test")
     drawn = known.draw(150, 1, stream=stream)[:, 0]
-    files = {name: folder / name.lower() for name in ("ABSENT", "OTHER", "UNSAID", "OWN")}
+    files = {name: folder / name.lower() for name in ("ABSENT", "OTHER", "UNSAID")}
     DecoyGenerator.fit(drawn, made_with="ab" * 32).save(files["OTHER"])
     DecoyGenerator.fit(drawn).save(files["UNSAID"])
-    DecoyGenerator.fit(drawn, made_with=known.made_with).save(files["OWN"])
-    return {**files, "CONTRACT": world.data / "contract.json"}
+    return files
 
 
 @pytest.mark.parametrize(("arguments", "reason", "status"), TEMPLATES)

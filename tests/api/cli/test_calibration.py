@@ -1,40 +1,12 @@
-"""Axes and dimension that a calibration takes, and faces of which nobody knows who they are."""
+"""The verdict of a calibration in words."""
 
-from pathlib import Path
+from dataclasses import replace
 
-import numpy as np
 import pytest
 
-from api.cli.calibration import operating_point
 from api.cli.verdict import plain_lines, verdict_lines
-from models.extraction import Extraction
 from templates.contract.levels import Rate
 from templates.contract.verdict import Judgement, Verdict
-from templates.space.lifting import Strategy
-from tests.verify.population import N, decoys, photos_of, unit
-from verify import CalibrationOptions
-from verify.preparation import without_lookalikes
-
-
-@pytest.mark.parametrize("asked", [None, 8])
-def test_so_few_people_show_nothing_of_any_dimension(asked: int | None) -> None:
-    point = operating_point(
-        photos_of(30, 2, seed=4).reshape(-1, N),
-        [str(number // 2) for number in range(60)],
-        decoys(),
-        strategy=Strategy.ADVERSARIAL,
-        axes=None,
-        m=asked,
-        options=CalibrationOptions(),
-        progress=lambda _what, _share: None,
-    )
-    assert asked in (None, point.dim)
-    assert (point.axes, point.dim) in [(one.axes, one.m) for one in point.tried]
-    assert point.privacy.status == "NOT SHOWN"
-    (said, accuracy, _) = verdict_lines(Verdict(point.privacy))
-    assert said.startswith("Privacy: not proven. ")
-    assert "This is not enough to prove it: 15 people are too few to choose by" in said
-    assert accuracy.startswith("Accuracy: not measured: nobody is labelled with two photos.")
 
 
 def judged(errors: int, trials: int, *, shortfall: str | None = None, **basis: int) -> Judgement:
@@ -98,18 +70,13 @@ def test_the_verdict_in_words_for_everybody(
     assert (of_whom in line) == (privacy.status == "PASS")
 
 
-def test_of_faces_that_look_alike_the_first_stays() -> None:
-    rows = unit(np.random.default_rng(8).normal(size=(4, N)))
-    rows[2] = unit(rows[0] + 0.5 * rows[3])
-    paths = [Path(f"{number}.jpg") for number in range(4)]
-    kept = without_lookalikes(Extraction(rows, paths, [], cached=0))
-    assert [path.name for path in kept.paths] == ["0.jpg", "1.jpg", "3.jpg"]
-    np.testing.assert_array_equal(kept.embeddings, rows[[0, 1, 3]])
-
-
-def test_copies_among_thousands_are_dropped() -> None:
-    rows = unit(np.random.default_rng(9).normal(size=(5_000, 128)))
-    rows[7], rows[4_999] = rows[3], rows[2_500]
-    paths = [Path(f"{number}.jpg") for number in range(len(rows))]
-    kept = without_lookalikes(Extraction(rows, paths, [], cached=0))
-    assert {int(path.stem) for path in kept.paths} == set(range(5_000)) - {7, 4_999}
+def test_the_worst_group_and_what_was_not_counted_are_named() -> None:
+    basis = {**PHOTOS, "photos": 2000, "photos_not_acquired": 7}
+    group = {"attribute": "race", "group": "x", "level": "fmr-1e-2", "groups_from": "a label file"}
+    bad = judged(80, 400)
+    verdict = Verdict(
+        bad, replace(bad, basis=basis), replace(bad, basis={**group, "probe_photos": 1})
+    )
+    _, accuracy, last = verdict_lines(verdict)
+    assert accuracy.endswith(" Not counted: 7 of 2,000 photos without a usable face.")
+    assert last.startswith("Groups: FAIL. Worst is race x: 20 % (80")

@@ -199,16 +199,3 @@ def test_a_photo_without_a_face_is_a_failure_to_acquire(bench, tmp_path):
         assert [row["failed_genuine"], row["failed_impostor"]] == lost
         assert [row["n_genuine"], row["n_impostor"]] == [PAIRS // 2 - count for count in lost]
     assert name in (tmp_path / "out" / "results.md").read_text()
-
-
-def test_attributes_are_predicted_from_a_labelled_pool(bench, tmp_path):
-    ran = run(
-        *("evaluate", bench.lfw, *bench.base, "--decoys", bench.root / "pool.veil"),
-        *("--strategy", "hybrid+", "--dim", "2", "--mode", "s2s", "--metric", "spherical"),
-        *("--repeats", "1", "--fmr", "0.2", "--shared-decoys", "--out", tmp_path, "--json"),
-    )
-    assert ran.status == 0, ran.stderr
-    images = ran.json["datasets"][0]["images"]
-    assert ran.json["options"]["predicted_attributes"] == {"lfw": images}
-    (row,) = ran.json["rows"]
-    assert (row["strategy"], row["decoys"], row["shared_decoys"]) == ("hybrid+", "pool", True)

@@ -3,10 +3,8 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from models.synthetic import encode_photo
 from tests.api.cli.conftest import Ran, run
 
 pytestmark = pytest.mark.long
@@ -91,33 +89,3 @@ def test_lifted_rows_have_the_order_of_the_paper(part: Part) -> None:
         assert auc["adversarial", 8, "s2s", metric] < auc["adversarial", 2, "s2s", metric]
         assert auc["adversarial", 8, "s2s", metric] < auc["adversarial", 8, "p2s", metric]
     assert auc["adversarial", 8, "s2s", "euclidean"] < auc["adversarial", 8, "s2s", "spherical"]
-
-
-def test_photos_are_detected_and_one_without_a_face_is_listed(
-    part: Part, lfw_photos: Path, tmp_path: Path
-) -> None:
-    people = sorted(one for one in lfw_photos.iterdir() if one.is_dir())[:FOLDS]
-    photos = [sorted(person.glob("*.jpg"))[:2] for person in people]
-    blank = tmp_path / "blank.png"
-    blank.write_bytes(encode_photo(np.full((250, 250, 3), 127, np.uint8)))
-    lines = ["path_a,path_b,same,fold"]
-    for fold, (one, two) in enumerate(photos):
-        lines.append(f"{one},{two},1,{fold}")
-        lines.append(f"{one},{photos[fold - 1][1]},0,{fold}")
-    lines.append(f"{photos[0][0]},blank.png,0,0")
-    (tmp_path / "own.csv").write_text("\n".join(lines), encoding="utf-8")
-    ran = run(
-        *("evaluate", tmp_path / "own.csv", "--pack", part.pack, "--strategy", "raw"),
-        *("--fmr", "0.5", "--jobs", "1", "--out", tmp_path / "out", "--json"),
-    )
-    assert ran.status == 0, ran.stderr
-    (dataset,) = ran.json["datasets"]
-    assert dataset["aligned"] is False
-    assert [(one["image"], one["code"]) for one in dataset["failures"]] == [
-        ("blank.png", "no_face")
-    ]
-    assert (dataset["failed_genuine"], dataset["failed_impostor"]) == (0, 1)
-    assert "own: 1 of 21 photos skipped" in ran.stderr
-    for row in ran.json["rows"]:
-        assert (row["n_genuine"], row["n_impostor"]) == (FOLDS, FOLDS)
-        assert row["auc"] > 0.95

@@ -18,7 +18,7 @@ PROMISED = {
         "db check",
         "db compact",
     ),
-    *("keys create", "keys list", "keys revoke", "keys master", "keys rotate", "keys rewrap"),
+    *("keys create", "keys list", "keys revoke", "keys rotate", "keys rewrap"),
     *("keys verify-receipt", "keys rotate-tenant", "keys renew"),
     *("db unlock", "db purge", "db erase-tenant", "db template-enrollment"),
     *("audit-log verify", "audit-log head", "audit-log show"),

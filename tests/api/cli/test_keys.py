@@ -29,13 +29,15 @@ def store(data):
 def test_a_key_is_made_listed_and_revoked(veilface, store):
     made = veilface(
         *("keys", "create", "--right", "enroll", "--right", "verify"),
-        *("--label", "shop", "--days", "30", "--json"),
+        *("--label", "shop", "--days", "30", "--lowest-level", "fmr-1e-4", "--json"),
     )
     assert made.status == 0, made.stderr
     token, prefix = made.json["token"], made.json["prefix"]
     found = store.api_keys.verify(token)
     assert found is not None
     assert sorted(found.rights) == ["enroll", "verify"]
+    assert found.lowest_level == made.json["lowest_level"] == "fmr-1e-4"
+    assert veilface("keys", "create", "--right", "verify", "--lowest-level", "?").status == 1
 
     listed = veilface("keys", "list", "--json")
     assert [(key["prefix"], key["label"]) for key in listed.json] == [(prefix, "shop")]
@@ -48,19 +50,6 @@ def test_a_key_is_made_listed_and_revoked(veilface, store):
     assert again.status == 1
     assert again.json == {"prefix": prefix, "revoked": False}
     assert "revoked" in veilface("keys", "list").stdout
-
-
-def test_a_lowest_level_is_shown_and_kept(veilface, store):
-    made = veilface("keys", "create", "--right", "verify", "--lowest-level", "fmr-1e-4", "--json")
-    assert made.json["lowest_level"] == "fmr-1e-4"
-    assert store.api_keys.verify(made.json["token"]).lowest_level == "fmr-1e-4"
-    free = veilface("keys", "create", "--right", "verify", "--json")
-    listed = {key["prefix"]: key["lowest_level"] for key in veilface("keys", "list", "--json").json}
-    assert listed == {
-        made.json["prefix"]: "fmr-1e-4",
-        free.json["prefix"]: None,
-    }
-    assert veilface("keys", "create", "--right", "verify", "--lowest-level", "?").status == 1
 
 
 def test_the_token_alone_is_on_stdout_or_in_a_private_file(veilface, store, tmp_path):
@@ -81,20 +70,6 @@ def test_the_token_alone_is_on_stdout_or_in_a_private_file(veilface, store, tmp_
     after = veilface("keys", "list", "--json").json
     assert [key["prefix"] for key in after] == [key["prefix"] for key in before]
     assert store.api_keys.verify(file.read_text().strip()) is not None
-
-
-def test_the_master_key_is_made_once(tmp_path):
-    file = tmp_path / "deep" / "key"
-    made = run("keys", "master", "--master-key-file", file, "--json")
-    assert made.status == 0, made.stderr
-    assert stat.S_IMODE(file.stat().st_mode) == 0o600
-    before = file.read_bytes()
-    assert base64.b64encode(base64.b64decode(before)).strip() == before.strip()
-    assert before.decode().strip() not in made.stdout
-    again = run("keys", "master", "--master-key-file", file)
-    assert again.status == 1
-    assert "exists already" in again.stderr
-    assert file.read_bytes() == before
 
 
 def test_rotation_wraps_everything_again_and_retires_the_old_key(world, veilface, data):

@@ -98,7 +98,7 @@ def test_an_archive_becomes_a_pack(site: Site, graph: bytes) -> None:
     assert site.asked == ["/latest", "/mine.zip"]
     assert ran.json["sha256"] == {f"{site.url}/latest": hashlib.sha256(archive).hexdigest()}
     assert "not-to-be-shown" not in ran.stdout + ran.stderr
-    assert "Left in the archive: 1 file." in ran.stderr
+    assert "Left in the archive: 1 files." in ran.stderr
     assert [file.name for file in Path("packs/mine").iterdir()] == ["rec.onnx"]
     assert list(Path("packs").iterdir()) == [Path("packs/mine")]
     assert run("models", "inspect", "packs/mine").status == 0

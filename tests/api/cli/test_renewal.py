@@ -95,11 +95,11 @@ def test_it_renews_all_and_says_what_is_left_to_do(used: tuple[Path, dict[str, A
     for said in (
         f"anchor: {anchor}\n",
         "enroll again default: ada, bob\n",
-        "veilface keys rotate-tenant --tenant default --stolen --finish",
-        f"veilface keys revoke {key.prefix}",
+        f"replace api keys: {key.prefix}\n",
         "receipts signed again: 1\n",
     ):
         assert said in ran.stdout
+    assert "Renewing every secret" in ran.stderr
     before = public_key_of(known["secrets"][SecretName.RECEIPT])
     assert verify_archive(data / "archive.jsonl", before).lines > 0
     # The log goes on where the archive ends.

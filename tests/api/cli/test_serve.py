@@ -112,20 +112,6 @@ def test_a_taken_port_is_named(world, data):
     assert f"cannot listen on 127.0.0.1:{port}" in ran.stderr
 
 
-def test_the_check_looks_at_the_key_of_tls_and_the_storage_of_limits(world, data, tmp_path):
-    common = ("serve", "--check", "--data-dir", data, "--pack", world.pack)
-    key = tmp_path / "key.pem"
-    key.write_text("")
-    key.chmod(0o644)
-    open_to_all = run(*common, "--tls-certificate", key, "--tls-key", key)
-    assert open_to_all.status == 1
-    assert "chmod 600" in open_to_all.stderr
-    storage = run(*common, "--rate-limit-storage", "redis://:hunter2@host:port")
-    assert storage.status == 1
-    assert "rate_limit_storage" in storage.stderr
-    assert "hunter2" not in storage.stderr
-
-
 @pytest.mark.parametrize("arguments", [("--help",), ("db", "upgrade", "--json")])
 def test_the_module_is_the_command(tmp_path, arguments):
     ran = subprocess.run(

@@ -55,24 +55,13 @@ def stops(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(command, "calibrate_folder", stop)
 
 
-def test_people_who_are_not_labelled_are_refused_with_the_reason(folders: Path) -> None:
-    for number, photo in enumerate(sorted(Path("people").glob("*/*.png"))):
-        photo.rename(folders / f"{number}.png")
-    for person in Path("people").iterdir():
-        person.rmdir()
-    for number in range(50):
-        (folders / f"{number}.png").rename(folders / "people" / f"{number}.png")
-    refused = setup()
-    assert refused.status == 1
-    assert "50 photos and no folder for a person: nobody is labelled" in refused.stderr
-    assert not (folders / "veilface-data").exists()
-
-
-def test_faces_too_few_for_a_threshold_are_refused_with_the_number(folders: Path) -> None:
-    refused = run("setup", "--faces", "faces", "--pack", "pack")
-    assert refused.status == 1
-    assert "--faces has 100 photos: half of them set the thresholds" in refused.stderr
-    assert "give 200 or more" in refused.stderr
+def test_what_cannot_be_prepared_is_refused_before_anything_is_made(folders: Path) -> None:
+    for people, said in (
+        (["faces/person-5000"], "1 photos and no folder for a person: nobody is labelled"),
+        ([], "--faces has 100 photos: half of them set the thresholds"),
+    ):
+        refused = run("setup", *people, "--faces", "faces", "--pack", "pack")
+        assert (refused.status, said in refused.stderr) == (1, True), refused.stderr
     assert not (folders / "veilface-data").exists()
 
 
@@ -90,7 +79,7 @@ def test_five_colleagues_are_left_aside_and_thresholds_set_on_the_faces(
         "stranger in 100 is accepted, and 80 that 1 in 1,000 is: thresholds are set on --faces "
         "instead" in ran.stderr
     )
-    assert "decoys of 101 faces; thresholds on 100 people, 100 photos" in ran.stderr
+    assert "people 100, photos 100, faces 101, sample 0" in ran.stderr
     refused = run(*arguments, "--like", "people")
     assert refused.status == 2
     assert "PEOPLE are too few" in refused.stderr
@@ -238,7 +227,7 @@ def test_settings_of_somebody_else_are_kept(
     ran = prepared("--pack", world.pack)
     assert ran.status == 1
     assert file.read_text() == "port = 9000\n"
-    assert "says something else of data_dir, pack" in ran.stderr
+    assert "`veilface serve` would start another service" in ran.stderr
     assert f'data_dir = "{data}"' in ran.stderr
     assert "Start it" not in ran.stdout
     agreeing = f'port = 9000\npack = "{world.pack}"\ndata_dir = "data"\n'
@@ -277,8 +266,7 @@ def test_from_nothing_to_a_contract(folders: Path, monkeypatch: pytest.MonkeyPat
         patch.setattr(command, "share_done", recorded)
         ran = setup()
     assert ran.status == 0, ran.stderr
-    assert "look at them, and put the photos of one person into one folder:" in ran.stderr
-    assert "Six Thousand, person-6000: 1.000" in ran.stderr
+    assert "Six Thousand and person-6000 look alike" in ran.stderr
     # The search for axes and dimension counts too: it takes the first 60 %.
     assert shares == sorted(shares)
     assert (shares[0], shares[-1]) == (0.0, 1.0)
