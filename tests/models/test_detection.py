@@ -1,10 +1,18 @@
+import io
+
+import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
-from models.boxes import Face
+from models.alignment import align
+from models.boxes import Face, ranked
+from models.decoding import decode_image
 from models.detection import RETRY_BORDER, find_faces, letterbox
 from models.detectors import Scrfd, YuNet
 from models.errors import ModelError
+from models.pack import ModelPack
+from models.selection import FacePolicy
 from models.sessions import Tensor
 
 STRIDES = (8, 16, 32)
@@ -262,3 +270,49 @@ def test_looks_again_near_and_then_in_a_border(wanted, shape):
         assert (across == 0).mean() == pytest.approx(0.8 / 1.8, abs=0.03)
     # The middle of the picture, however it was looked at.
     np.testing.assert_allclose(face.keypoints[0], [shape[1] / 2, shape[0] / 2], atol=1)
+
+
+def jpeg(pixels: np.ndarray) -> bytes:
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, "JPEG", quality=95)
+    return file.getvalue()
+
+
+def tight_and_bystander(photo: np.ndarray, face: Face, other: np.ndarray, margin: float):
+    """Cut ``face`` out with a margin, enlarge to 900 pixels, put ``other`` into a corner."""
+    reach = margin * max(face.width, face.height)
+    edges = np.clip(face.box + np.array([-reach, -reach, reach, reach]), 0, len(photo)).astype(int)
+    crop = photo[edges[1] : edges[3], edges[0] : edges[2]]
+    factor = 900 / max(crop.shape[:2])
+    size = (round(crop.shape[1] * factor), round(crop.shape[0] * factor))
+    crop = cv2.resize(crop, size, interpolation=cv2.INTER_CUBIC)
+    alone = crop.copy()
+    small = cv2.resize(other[50:200, 65:185], (72, 90), interpolation=cv2.INTER_AREA)
+    crop[:90, :72] = small
+    points = (face.keypoints - edges[:2]) * np.divide(size, (edges[2:] - edges[:2]))
+    return alone, crop, points
+
+
+def tight_photos(pack, photos, margins):
+    """Tight photos without and with a bystander, and the descriptor of the right crop of each."""
+    for index, photo in enumerate(photos):
+        faces = ranked(pack._detector.detect_once(photo, (320, 320)), photo.shape)
+        other = photos[(index + 1) % len(photos)]
+        for margin in margins:
+            alone, both, points = tight_and_bystander(photo, faces[0], other, margin)
+            for picture in (alone, both):
+                yield picture, pack.embed(align(picture, points, size=112)[None])[0]
+
+
+PACKS = ["w600k_mbf", "yunet_mobilefacenet128"]
+
+
+@pytest.mark.parametrize("name", PACKS)
+def test_a_bystander_is_never_taken_for_a_face_that_fills_the_photo(name, shared_data, lfw_photos):
+    """On one canvas of 640 SCRFD sees the bystander alone: the cosine is that of two strangers."""
+    pack = ModelPack.load(shared_data / "packs" / name, threads=1)
+    photos = [decode_image(p.read_bytes()) for p in sorted(lfw_photos.glob("*/*_0001.jpg"))[:3]]
+    pictures = list(tight_photos(pack, photos, margins=(0.05,)))
+    for picture, right in pictures:
+        for policy in (FacePolicy.DOMINANT, FacePolicy.LARGEST):
+            assert pack.embed_photo(jpeg(picture), policy=policy).embedding @ right > 0.8
