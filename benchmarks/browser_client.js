@@ -21,12 +21,7 @@ const photo = async (name) => (await fetch(`/photos/${name}`)).blob();
 
 async function under(subject, action, call) {
   const { token } = await authorize(subject, action);
-  const client = prepared.as(token);
-  try {
-    return await call(client);
-  } finally {
-    await client.close();
-  }
+  return call({ token });
 }
 
 // Many errors of the client have no code, and all have a name.
@@ -71,7 +66,7 @@ window.visit = {
 
   enroll: async (subject, names) => {
     const photos = await Promise.all(names.map(photo));
-    return told(under(subject, "enroll", (client) => client.enroll(subject, photos, { face })));
+    return told(under(subject, "enroll", (given) => prepared.enroll(subject, photos, { ...given, face })));
   },
 
   // One photo, from the moment it is there to the answer.
@@ -81,7 +76,7 @@ window.visit = {
     const answer = await told(
       prepared.lift([data], { face }).then((probe) => {
         probes.set(name, probe);
-        return under(subject, "verify", (client) => client.verify(subject, probe));
+        return under(subject, "verify", (given) => prepared.verify(subject, probe, given));
       }),
     );
     return { ...answer, seconds: since(start) };
@@ -90,7 +85,7 @@ window.visit = {
   // The probe of a photo, lifted once for all its attempts: for nobody else, if not for its person.
   attempt: async (subject, name) =>
     probes.has(name)
-      ? told(under(subject, "verify", (client) => client.verify(subject, probes.get(name))))
+      ? told(under(subject, "verify", (given) => prepared.verify(subject, probes.get(name), given)))
       : { error: "not_lifted" },
 
   // The next logins of the element are this person's.

@@ -4,19 +4,17 @@ A service serves its pack (``serve_pack``). A page of its own origin holds token
 attempt, and enrolls photos 1-3 of every person by templates that it lifts itself; photos 4-5 are
 lifted once each and verified against the person (genuine) and all others (impostor). The Python
 private client then does the same with the same photos. An enrollment that is refused counts as
-failed genuine attempts. Then every person stands before a fake camera, and ``<veilface-login>`` is
-timed from the click to its answer; and so is the service's own page in private mode, from the
-press of *Verify*, which takes the photos too. Every byte that the browser sends goes through
-a recording proxy, no other host has an address for it, and the recording is searched for the
-photos, what the camera showed, and their embeddings; those that are sent on purpose afterwards
-must be found.
+failed genuine attempts. Then every person stands before a fake camera, and ``<veilface-login>``,
+which the service's own page has in private mode too, is timed from the click to its answer. Every
+byte that the browser sends goes through a recording proxy, no other host has an address for it, and
+the recording is searched for the photos, what the camera showed, and their embeddings; those that
+are sent on purpose afterwards must be found.
 
 Needs Chromium and the built client (``make javascript``).
 """
 
 import argparse
 import base64
-import re
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -25,12 +23,11 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from playwright.sync_api import BrowserContext, Locator, expect, sync_playwright
+from playwright.sync_api import BrowserContext, expect, sync_playwright
 
 from benchmarks import deployment
 from benchmarks.people import AttemptCounts, Person, attempt_all, impostor_attempts, people_of
 from models.pack import ModelPack
-from tests.clients.proxy import Proxy
 from tests.clients.recorded import faces_of, requests_in
 from tests.leaks import LeakSearch
 from tests.patience import PATIENCE_S
@@ -54,30 +51,6 @@ PLANTED = {
     "decimal text": ("embedding", "decimals"),
 }
 """What is sent on purpose: what must be found of it, and how the form of the leak begins."""
-SHUTTER = """async () => {
-  const there = (find) =>
-    new Promise((resolve) => {
-      const look = () => {
-        const found = find();
-        if (found) resolve(found);
-        return Boolean(found);
-      };
-      if (look()) return;
-      const observer = new MutationObserver(() => look() && observer.disconnect());
-      observer.observe(document.body, { subtree: true, childList: true, attributes: true });
-    });
-  const since = (start) => (performance.now() - start) / 1000;
-  const start = performance.now();
-  const buttons = [...document.querySelectorAll("form button")];
-  buttons.find(({ type }) => type === "submit").click();
-  await there(() => document.querySelector(".tray li"));
-  const taken = since(start);
-  const answer = await there(() => document.querySelector(".verdict, [role=alert]"));
-  const accepted = answer.matches(".accept");
-  const error = answer.matches(".verdict") ? null : answer.textContent;
-  return { seconds: since(start), taken, accepted, error };
-}"""
-"""Takes a burst and verifies it; when the photos were taken, and when the answer was there."""
 
 
 @dataclass
@@ -198,52 +171,6 @@ def _log_in(opened: Visit, person: Person) -> tuple[dict[str, Any], bytes]:
     return answer, frame
 
 
-def first_look(context: BrowserContext, url: str, key: str, subject: str) -> tuple[BrowserTab, int]:
-    """Open the service's page at its camera, until it has judged a frame in private mode.
-
-    Also returns the bytes that were downloaded for that.
-    """
-    tab = BrowserTab.of(context, url + "/")
-    tab.page.set_default_timeout(1000 * PATIENCE_S)
-    tab.sign_in(key)
-    _step_before(tab, subject)
-    size: int = tab.page.evaluate(
-        "performance.getEntries().reduce((sum, { transferSize }) => sum + (transferSize ?? 0), 0)"
-    )
-    return tab, size
-
-
-def by_the_shutter(
-    tab: BrowserTab, camera: FakeCamera, people: Sequence[Person], *, level: str
-) -> list[dict[str, Any]]:
-    """Verify everybody on the service's page; what it told each, and after how long."""
-    answers = []
-    for person in people:
-        camera.shows(person.probes[0])
-        guidance = _step_before(tab, person.name)
-        tab.page.get_by_label("Level").select_option(level)
-        if guidance.get_attribute("data-state") == "good":
-            answers.append(tab.page.evaluate(SHUTTER))
-        else:
-            answers.append({"accepted": False, "error": guidance.text_content()})
-    return answers
-
-
-def _step_before(tab: BrowserTab, subject: str) -> Locator:
-    # Leaving the view stops the camera.
-    tab.open("Service")
-    tab.open("Verify")
-    expect(tab.page.get_by_role("switch", name="Private mode")).to_be_checked()
-    tab.name_person(subject)
-    # Some of these photos have others in their background.
-    tab.page.get_by_text("Options").click()
-    tab.page.get_by_label("Others are in the picture").check()
-    tab.press("Start camera")
-    guidance = tab.page.locator(".guidance")
-    expect(guidance).to_have_attribute("data-state", re.compile("good|bad"))
-    return guidance
-
-
 def planted_and_missed(opened: Visit, photo: Path, search: LeakSearch) -> list[str]:
     """Send this photo and its embedding in every form; those that the search did not find."""
     (name,) = opened.show([photo])
@@ -303,24 +230,18 @@ def measure(args: argparse.Namespace) -> list[dict[str, object]]:
         browser, seconds = browser_outcome(opened, people, impostors=impostors)
         there = [each for each in people if each.name not in browser.refused_enrollments]
         by_camera, shown = before_the_camera(opened, camera, there)
-        recording = stack.enter_context(Proxy(int(service.url.rsplit(":", 1)[1])))
-        camera.shows(there[0].probes[0])
-        looked, page_bytes = first_look(context, recording.url, key, there[0].name)
-        looked.page.close()
-        second, page_bytes_again = first_look(context, recording.url, key, there[0].name)
-        by_page = by_the_shutter(second, camera, there, level=level)
-        sent = served.recording.sent + recording.sent
+        sent = served.recording.sent
         calls, rest = requests_in(sent)
         more = {photo.name: photo.read_bytes() for person in people for photo in person.probes}
         enrolled = {person.name: person.enroll for person in people}
         search = faces_of(pack, enrolled, {**more, **shown})
         leaks = search.find(sent)
         missed = planted_and_missed(opened, people[0].probes[0], search)
-        tabs = [first.tab, opened.tab, looked, second]
+        tabs = [first.tab, opened.tab]
         complaints = [complaint for tab in tabs for complaint in tab.complaints]
-        complaints += [*opened.tab.violations(), *second.violations()]
+        complaints += opened.tab.violations()
         # Each tab has noted every request of the browser.
-        here = (served.url, recording.url, "blob:", "data:")
+        here = (served.url, "blob:", "data:")
         strays = sorted({each for each in first.tab.requests if not each.startswith(here)})
         with PrivateClient(service.url, key, pack=args.pack, dim=args.probe_dim) as client:
             python = attempt_all(client, people, level=level, face="largest", impostors=impostors)
@@ -335,8 +256,6 @@ def measure(args: argparse.Namespace) -> list[dict[str, object]]:
         "until a lift can be made, first and second visit": "; ".join(visits),
         "photo to answer": _seconds(seconds),
         "click to answer, `<veilface-login>`": _answered(by_camera),
-        "shutter to answer, own page": _answered(by_page),
-        "own page, bytes of the first and second visit": f"{page_bytes:,}, {page_bytes_again:,}",
         "sent": f"{len(sent):,} bytes; {rest} of no request; to other hosts: {strays or 'none'}",
         **{
             f"sent by {call}": f"{each['times']} times, {each['members']}, at most "

@@ -10,19 +10,10 @@ import pytest
 
 from tests.api.deployment import photo
 from tests.clients.conftest import VEILFACE, Running
+from tests.clients.pages import EXAMPLE, ROOT, blocks
 from veilface_client import Client
 
-ROOT = Path(__file__).resolve().parents[2]
 CLIENT, DISTRIBUTION = PAGES = ("docs/python.md", "clients/python/README.md")
-EXAMPLE = "http://127.0.0.1:8421"
-
-
-def blocks(page: str, language: str) -> list[str]:
-    """The fenced blocks of a page."""
-    text = (ROOT / page).read_text(encoding="utf-8")
-    return re.findall(rf"^```{language}\n(.*?)^```", text, flags=re.MULTILINE | re.DOTALL)
-
-
 PYTHON = [
     pytest.param(block, id=f"{page}-{number}")
     for page in PAGES

@@ -8,7 +8,7 @@ export type { Runtime } from "./models/runtime.js";
 export { Client, newHolderKey, type EnrollOptions, type VerifyOptions } from "./service/client.js";
 export { createPasskey, passkeyHolderKey, whyNoPasskey, type Passkey } from "./service/passkey.js";
 export { Lift, PrivateClient, type Photo, type PrivateOptions } from "./service/private-client.js";
-export { DEFAULT_RETRIES, type ClientOptions, type Retries } from "./service/sending.js";
+export type { ClientOptions } from "./service/sending.js";
 export * from "./templates/contract.js";
 export { DecoyGenerator } from "./templates/generator.js";
 export * from "./templates/lifting.js";

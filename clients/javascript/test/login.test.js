@@ -60,8 +60,7 @@ Object.assign(globalThis, {
     }
   },
 });
-const { VeilfaceLogin, PasskeyError, WORDS } = await import("../dist/element/login.js");
-const { ContractError, PhotoError, ServiceError } = await import("../dist/errors.js");
+const { VeilfaceLogin, VeilfaceError, WORDS } = await import("../dist/element/login.js");
 
 const settled = () => new Promise((resolve) => setTimeout(resolve));
 
@@ -87,7 +86,7 @@ function element({ authorize, fetch, camera = async () => {} } = {}) {
     login.addEventListener(name, ({ detail }) => told.push(detail));
   }
   login.setAttribute("service", "http://127.0.0.1:1");
-  login.options = { runtime: {}, fetch, retries: { sendings: 1 } };
+  login.options = { runtime: {}, fetch };
   login.authorize = authorize;
   login.enter();
   return { login, tracks, told };
@@ -215,16 +214,16 @@ test("a camera that ends is said and told, and ends the attempt", async () => {
 
 test("the camera stays on only where another photo, or the passkey, may help", async () => {
   const { login, tracks, told } = element();
-  const refused = (code, status) => new ServiceError({ code, status, message: code });
+  const refused = (code, status) => new VeilfaceError(code, code, { status });
   for (const [error, stopped] of [
-    [new PhotoError("no_face", "nobody"), false],
+    [new VeilfaceError("no_face", "nobody"), false],
     [refused("low_quality", 422), false],
-    [new PhotoError("inconsistent_images", "two"), false],
-    [new PasskeyError("passkey_refused", ""), false],
-    [new PasskeyError("passkey_unsupported", ""), true],
+    [new VeilfaceError("inconsistent_images", "two"), false],
+    [new VeilfaceError("passkey_refused", ""), false],
+    [new VeilfaceError("passkey_unsupported", ""), true],
     [refused("forbidden", 403), true],
     [refused("locked_out", 423), true],
-    [new ContractError("not that of the contract"), true],
+    [new VeilfaceError("unusable_contract", "not that of the contract"), true],
     [new TypeError("a defect"), true],
   ]) {
     login.attempt = async () => { throw error; };
@@ -232,7 +231,7 @@ test("the camera stays on only where another photo, or the passkey, may help", a
     await settled();
     login.button.click();
     while (told.at(-1) !== error) await settled();
-    assert.equal(tracks.at(-1).stopped, stopped, error.name);
+    assert.equal(tracks.at(-1).stopped, stopped, error.code ?? error.name);
   }
 });
 

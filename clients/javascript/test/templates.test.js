@@ -2,9 +2,9 @@ import assert from "node:assert/strict";
 import { test } from "node:test";
 import { inspect } from "node:util";
 
-import { ContractError, DecoyGenerator, meanEmbedding, PhotoError } from "../dist/index.js";
+import { DecoyGenerator, meanEmbedding, VeilfaceError } from "../dist/index.js";
 import { normal, uniform } from "../dist/templates/samples.js";
-import { encode, float16, orthonormalised, rowsOf, templateThrough } from "../dist/templates/subspace.js";
+import { float16, orthonormalised, rowsOf, templateThrough } from "../dist/templates/subspace.js";
 
 const dot = (a, b) => a.reduce((sum, value, i) => sum + value * b[i], 0);
 
@@ -24,12 +24,6 @@ test("samples are made of all 53 bits, and fit their distributions at the edges"
   draws(t, () => 0xffffffff);
   assert.equal(uniform(1)[0], 1 - 2 ** -53);
   assert.ok(Math.abs(normal(1)[0] - Math.sqrt(106 * Math.LN2)) < 1e-12);
-});
-
-test("samples are of the platform's generator, also more than one call of it gives", () => {
-  const samples = uniform(20_000, -1, 1);
-  assert.equal(new Set(samples).size, samples.length);
-  assert.notEqual(normal(1)[0], normal(1)[0]);
 });
 
 test("a template contains its point, is orthonormal, and hides which directions made it", (t) => {
@@ -57,8 +51,8 @@ test("a template contains its point, is orthonormal, and hides which directions 
 
 test("directions that depend on each other are refused", () => {
   const row = Float64Array.from([1, 2, 3]);
-  assert.throws(() => orthonormalised([row, row.map((value) => 2 * value)]), ContractError);
-  assert.throws(() => orthonormalised([new Float64Array(3)]), ContractError);
+  assert.throws(() => orthonormalised([row, row.map((value) => 2 * value)]), { code: "unusable_contract" });
+  assert.throws(() => orthonormalised([new Float64Array(3)]), { code: "unusable_contract" });
 });
 
 test("numbers are rounded to float16 as IEEE 754 says", () => {
@@ -70,42 +64,21 @@ test("numbers are rounded to float16 as IEEE 754 says", () => {
   for (const [value, bits] of cases) assert.equal(float16(value), bits, String(value));
 });
 
-test("a template's bytes are a header of whole eights, then foot and basis", () => {
-  const template = { foot: Float32Array.of(0, 0.5), basis: Float32Array.of(1, 0) };
-  const bytes = encode(template, "ab".repeat(32));
-  const length = Number(new DataView(bytes.buffer).getBigUint64(0, true));
-  assert.equal(length % 8, 0);
-  const header = JSON.parse(new TextDecoder().decode(bytes.subarray(8, 8 + length)));
-  assert.deepEqual(header.basis, { dtype: "F16", shape: [1, 2], data_offsets: [4, 8] });
-  assert.deepEqual([...bytes.subarray(8 + length)], [0, 0, 0, 0x38, 0, 0x3c, 0, 0]);
-  const made = templateThrough(Float64Array.of(0, 0.5), [Float64Array.of(1, 0)]);
-  assert.equal(inspect(made), "{}", "no number of it is printed");
+test("no number of a template is printed", () => {
+  assert.equal(inspect(templateThrough(Float64Array.of(0, 0.5), [Float64Array.of(1, 0)])), "{}");
 });
 
-test("photos that part into two people are named as the service names them", () => {
-  const [one, other] = [Float32Array.of(1, 0, 0), Float32Array.of(0, 1, 0)];
-  const near = Float32Array.of(0.96, 0, 0.28);
-  for (const [rows, message, photos] of [
-    [[one, other], "photos 1 and 2 do not look like the same person", [0, 1]],
-    [[one, other, near], "photo 2 does not look like the person on photos 1 and 3", [1]],
-    [[one, other, other.with(2, 0.1), near], "photos 2 and 3 do not look like the person on photos 1 and 4", [0, 1, 2, 3]],
-  ]) {
-    assert.throws(() => meanEmbedding(rows, 0.5), (error) => {
-      assert.ok(error instanceof PhotoError);
-      assert.deepEqual([error.code, error.message.split(";")[0], error.details], ["inconsistent_images", message, { photos }]);
-      return true;
-    });
-  }
-  assert.ok(meanEmbedding([one, near], 0.5)[0] > 0.98);
+test("photos that cancel are refused, and one that comes again counts once", () => {
+  const [one, near] = [Float32Array.of(1, 0, 0), Float32Array.of(0.96, 0, 0.28)];
   assert.deepEqual(meanEmbedding([one, one, near], 0.5), meanEmbedding([one, near], 0.5));
-  assert.throws(() => meanEmbedding([one, one.map((value) => -value)], -1), PhotoError);
+  assert.throws(() => meanEmbedding([one, one.map((value) => -value)], -1), { code: "inconsistent_images" });
 });
 
 test("bytes that are no generator are refused without being repeated", async () => {
   const text = new TextEncoder().encode('{"secret": 1}');
   const bytes = Uint8Array.from([text.length, 0, 0, 0, 0, 0, 0, 0, ...text]);
   await assert.rejects(DecoyGenerator.fromBytes(bytes), (error) => {
-    return error instanceof ContractError && !error.message.includes("secret");
+    return error instanceof VeilfaceError && !error.message.includes("secret");
   });
-  await assert.rejects(DecoyGenerator.fromBytes(new Uint8Array(4)), ContractError);
+  await assert.rejects(DecoyGenerator.fromBytes(new Uint8Array(4)), { code: "unusable_contract" });
 });

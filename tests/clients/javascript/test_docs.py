@@ -10,15 +10,11 @@ import pytest
 from tests.api.deployment import photo, picture
 from tests.clients.conftest import Running
 from tests.clients.javascript.conftest import PACKAGE, Node
-from tests.clients.test_docs import EXAMPLE, ROOT, blocks
+from tests.clients.pages import EXAMPLE, IN_JAVASCRIPT, OF_THE_CLIENT, ROOT, blocks
 from veilface_client import Client
 
-BLOCKS = blocks("docs/javascript.md", "js")
-FOR_PAGES = [block for block in BLOCKS if "document." in block]
-(OF_THE_ELEMENT, OF_THE_CLIENT) = FOR_PAGES
 
-
-@pytest.mark.parametrize("block", [block for block in BLOCKS if block not in FOR_PAGES])
+@pytest.mark.parametrize("block", [each for each in IN_JAVASCRIPT if "document." not in each])
 def test_a_program_prints_what_it_says(
     block: str, node: Node, service: Running, tmp_path: Path
 ) -> None:

@@ -1,24 +1,21 @@
 /** `<veilface-login>`: camera, burst, decision, for any page. */
 
 import type { Decision, Enrollment } from "../answers.js";
-import { isPhotoRefused, PasskeyError, VeilfaceError } from "../errors.js";
+import { isPhotoRefused, VeilfaceError } from "../errors.js";
 import type { FacePolicy } from "../models/faces.js";
-import { fromImageData, type RgbImage } from "../models/image.js";
-import type { PhotoCheck } from "../models/pack.js";
+import { drawn, type RgbImage } from "../models/image.js";
 import { createPasskey, passkeyHolderKey, type Passkey } from "../service/passkey.js";
-import { PrivateClient, type Lift, type PrivateOptions } from "../service/private-client.js";
+import { PrivateClient, type PrivateOptions } from "../service/private-client.js";
 import { STYLE, type State } from "./look.js";
 import { withDefaults, type Words } from "./words.js";
 
-export { PasskeyError } from "../errors.js";
+export { VeilfaceError } from "../errors.js";
 export { WORDS, type Words } from "./words.js";
 
 /** What the page's server says when a person wants to log in: whose token it is, and the token. */
 export interface Authorization {
   readonly subject: string;
   readonly token: string;
-  /** In the place of a key from a passkey. */
-  readonly holderKey?: Uint8Array;
 }
 
 /** Of `PrivateClient`. */
@@ -33,9 +30,12 @@ const READING = 5000;
 const after = (milliseconds: number): Promise<void> =>
   new Promise((resolve) => setTimeout(resolve, milliseconds));
 
+const codeOf = (error: unknown): string | undefined =>
+  error instanceof VeilfaceError ? error.code : undefined;
+
 /** Another photo may help, or the passkey after all; for all else no camera is needed. */
 const isMendable = (error: unknown): boolean =>
-  isPhotoRefused(error) || (error instanceof PasskeyError && error.code === "passkey_refused");
+  isPhotoRefused(error) || codeOf(error) === "passkey_refused";
 
 // A server that renders pages imports this module too, and has no elements.
 const Base = globalThis.HTMLElement ?? (class {} as typeof HTMLElement);
@@ -160,54 +160,30 @@ export class VeilfaceLogin extends Base {
     const photos = await this.#burst(signal);
     this.#enter("busy", this.words.working);
     try {
-      return await this.#send(await this.#lifted(photos, signal), signal);
+      const client = await this.#prepared(signal);
+      signal.throwIfAborted();
+      // Before a token or a passkey is asked for: the photos may not do.
+      const given = { face: this.#face };
+      const enrolls = this.#enrolls;
+      const lift = await (enrolls ? client.liftEnrollment(photos, given) : client.lift(photos, given));
+      signal.throwIfAborted();
+      const { subject, token } = await this.#given().authorize();
+      signal.throwIfAborted();
+      const holderKey = await this.#holderKey(subject, enrolls, signal);
+      signal.throwIfAborted();
+      const options = { token, ...(holderKey && { holderKey }) };
+      const result = await (enrolls ? client.enroll(subject, lift, options) : client.verify(subject, lift, options));
+      signal.throwIfAborted();
+      return result;
     } catch (error) {
       // The next attempt is of the contract in force.
-      if (error instanceof VeilfaceError && error.code === "contract_mismatch") await this.#forgetClient();
+      if (codeOf(error) === "contract_mismatch") await this.#forgetClient();
       throw error;
     }
   }
 
-  /** Before a token or a passkey is asked for: the photos may not do. */
-  async #lifted(photos: RgbImage[], signal: AbortSignal): Promise<Lift> {
-    const client = await this.#prepared(signal);
-    signal.throwIfAborted();
-    const face = this.#face;
-    return this.#enrolls ? client.liftEnrollment(photos, { face }) : client.lift(photos, { face });
-  }
-
-  async #send(lift: Lift, signal: AbortSignal): Promise<Decision | Enrollment> {
-    const prepared = await this.#prepared(signal);
-    const { subject, token, holderKey } = await this.#authorized(signal, lift.kind === "enrollment");
-    const client = prepared.as(token);
-    try {
-      const more = holderKey && { holderKey };
-      const result = await (lift.kind === "enrollment"
-        ? client.enroll(subject, lift, more)
-        : client.verify(subject, lift, more));
-      signal.throwIfAborted();
-      return result;
-    } finally {
-      await client.close();
-    }
-  }
-
-  /** A token of the page's server, and the holder key that goes with it, where there is one. */
-  async #authorized(signal: AbortSignal, enrolls: boolean): Promise<Authorization> {
-    signal.throwIfAborted();
-    const { subject, token, ...more } = await this.#given().authorize();
-    signal.throwIfAborted();
-    const holderKey = more.holderKey ?? (await this.#holderKey(subject, enrolls, signal));
-    signal.throwIfAborted();
-    return { subject, token, ...(holderKey && { holderKey }) };
-  }
-
   /** The key of the person's passkey, where one is to be asked for. */
-  async #holderKey(
-    subject: string,
-    enrolls: boolean,
-    signal: AbortSignal,
-  ): Promise<Uint8Array | undefined> {
+  async #holderKey(subject: string, enrolls: boolean, signal: AbortSignal): Promise<Uint8Array | undefined> {
     if (this.getAttribute("passkey") === null) return undefined;
     this.#enter("busy", this.words.passkey);
     if (enrolls && this.#passkey?.subject !== subject) {
@@ -219,9 +195,7 @@ export class VeilfaceLogin extends Base {
       return key;
     } catch (error) {
       // It will not do the next time either.
-      if (error instanceof PasskeyError && error.code === "passkey_unsupported") {
-        this.#passkey = undefined;
-      }
+      if (codeOf(error) === "passkey_unsupported") this.#passkey = undefined;
       throw error;
     }
   }
@@ -235,13 +209,10 @@ export class VeilfaceLogin extends Base {
 
   /** The client whose graphs are loaded, or will be; what failed is tried again the next time. */
   #prepared(signal: AbortSignal): Promise<PrivateClient> {
-    if (this.#client === undefined) {
-      const client: Promise<PrivateClient> = this.#prepare(signal).catch((error: unknown) => {
-        if (this.#client === client) this.#client = undefined;
-        throw error;
-      });
-      this.#client = client;
-    }
+    this.#client ??= this.#prepare(signal).catch((error: unknown) => {
+      if (!signal.aborted) this.#client = undefined;
+      throw error;
+    });
     return this.#client;
   }
 
@@ -250,14 +221,8 @@ export class VeilfaceLogin extends Base {
     const { token } = await authorize();
     signal.throwIfAborted();
     const client = new PrivateClient(this.#url, token, { ...options, signal });
-    try {
-      await client.prepare();
-      signal.throwIfAborted();
-      return client;
-    } catch (error) {
-      await client.close();
-      throw error;
-    }
+    await client.prepare();
+    return client;
   }
 
   async #forgetClient(): Promise<void> {
@@ -308,8 +273,11 @@ export class VeilfaceLogin extends Base {
       const client = await this.#prepared(signal);
       while (!signal.aborted && this.#camera === camera) {
         if (this.#isIdle && !document.hidden) {
-          const seen = await client.check(this.#photo(signal), { face: this.#face });
-          if (this.#isIdle && this.#camera === camera) this.#guided(seen);
+          const fault = await client.check(this.#photo(signal), { face: this.#face });
+          if (this.#isIdle && this.#camera === camera) {
+            if (fault === undefined) this.#enter("ready", this.words.ready);
+            else this.#enter("searching", this.#wordsOf(fault));
+          }
         }
         await after(BETWEEN_LOOKS);
       }
@@ -320,13 +288,6 @@ export class VeilfaceLogin extends Base {
 
   get #isIdle(): boolean {
     return ["searching", "ready", "failed"].includes(this.#state) && Date.now() >= this.#quietUntil;
-  }
-
-  #guided({ usable, code, details, message }: PhotoCheck): void {
-    const { hints, ready } = this.words;
-    const known = [String(code), ...Object.keys(details)].find((name) => Object.hasOwn(hints, name));
-    if (usable) this.#enter("ready", ready);
-    else this.#enter("searching", known === undefined ? message : hints[known]);
   }
 
   async #try(): Promise<void> {
@@ -369,13 +330,7 @@ export class VeilfaceLogin extends Base {
   /** What the camera shows now. */
   #photo(signal: AbortSignal): RgbImage {
     signal.throwIfAborted();
-    const { videoWidth: width, videoHeight: height } = this.#video;
-    const context = new OffscreenCanvas(width, height).getContext("2d", {
-      willReadFrequently: true,
-    });
-    if (context === null) throw new Error("this browser gives no canvas to take photos with");
-    context.drawImage(this.#video, 0, 0);
-    return fromImageData(context.getImageData(0, 0, width, height));
+    return drawn(this.#video, this.#video.videoWidth, this.#video.videoHeight);
   }
 
   /** It was unplugged, forbidden, or taken by another program. */
@@ -412,12 +367,14 @@ export class VeilfaceLogin extends Base {
   }
 
   #wordsOf(error: unknown): string {
-    if (!(error instanceof Error)) return String(error);
-    const { code, details } = error as Error & { code?: unknown; details?: { liveness?: string } };
-    if (details?.liveness !== undefined) return this.words.liveness;
-    const { errors } = this.words;
-    if (typeof code === "string" && Object.hasOwn(errors, code)) return errors[code];
-    return code === "locked_out" ? `${error.message}. ${this.words.locked}` : error.message;
+    if (!(error instanceof VeilfaceError)) return error instanceof Error ? error.message : String(error);
+    const { code, details, message } = error;
+    const { errors, hints, liveness, locked } = this.words;
+    if (details.liveness !== undefined) return liveness;
+    if (Object.hasOwn(errors, code)) return errors[code];
+    const hint = [code, ...Object.keys(details)].find((name) => Object.hasOwn(hints, name));
+    if (hint !== undefined) return hints[hint];
+    return code === "locked_out" ? `${message}. ${locked}` : message;
   }
 
   #tell(event: string, detail: unknown): void {

@@ -6,32 +6,33 @@
  */
 export type State = "off" | "searching" | "ready" | "busy" | "accepted" | "rejected" | "failed";
 
+// Properties have names of their own: a page may set ours by an `--accent` of its own.
 export const STYLE = `
 :host {
-  --surface: var(--veilface-surface, light-dark(#fff, #182026));
-  --text: var(--veilface-text, light-dark(#17212b, #e7edf1));
-  --muted: var(--veilface-muted, light-dark(#4a5764, #abb7c0));
-  --line: var(--veilface-line, light-dark(#d3dade, #35414b));
-  --accent: var(--veilface-accent, light-dark(#0b5563, #7cc9d6));
-  --on-accent: var(--veilface-on-accent, light-dark(#fff, #06262c));
-  --good: var(--veilface-good, light-dark(#0b6239, #7fd6a4));
-  --bad: var(--veilface-bad, light-dark(#9b1c1c, #ff9d94));
-  --radius: var(--veilface-radius, 1rem);
-  display: block; width: 100%; max-width: var(--veilface-width, 22rem); color: var(--text);
+  --_surface: var(--veilface-surface, light-dark(#fff, #182026));
+  --_text: var(--veilface-text, light-dark(#17212b, #e7edf1));
+  --_muted: var(--veilface-muted, light-dark(#4a5764, #abb7c0));
+  --_line: var(--veilface-line, light-dark(#d3dade, #35414b));
+  --_accent: var(--veilface-accent, light-dark(#0b5563, #7cc9d6));
+  --_on-accent: var(--veilface-on-accent, light-dark(#fff, #06262c));
+  --_good: var(--veilface-good, light-dark(#0b6239, #7fd6a4));
+  --_bad: var(--veilface-bad, light-dark(#9b1c1c, #ff9d94));
+  --_radius: var(--veilface-radius, 1rem);
+  display: block; width: 100%; max-width: var(--veilface-width, 22rem); color: var(--_text);
   font-family: var(--veilface-font, system-ui, -apple-system, "Segoe UI", Roboto, sans-serif);
   font-size: 1rem; line-height: 1.4; text-align: center;
 }
 :host([hidden]), [hidden] { display: none; }
 *, ::before, ::after { box-sizing: border-box; }
 .card {
-  display: grid; gap: 0.9rem; padding: 1rem; background: var(--surface);
-  border: 1px solid var(--line); border-radius: var(--radius); box-shadow: 0 6px 24px rgb(0 0 0 / 0.1);
+  display: grid; gap: 0.9rem; padding: 1rem; background: var(--_surface);
+  border: 1px solid var(--_line); border-radius: var(--_radius); box-shadow: 0 6px 24px rgb(0 0 0 / 0.1);
 }
 .viewfinder {
-  --outline: var(--muted); --tint: color-mix(in srgb, var(--muted) 12%, var(--surface));
-  --figure: color-mix(in srgb, var(--muted) 28%, var(--surface));
+  --outline: var(--_muted); --tint: color-mix(in srgb, var(--_muted) 12%, var(--_surface));
+  --figure: color-mix(in srgb, var(--_muted) 28%, var(--_surface));
   position: relative; display: grid; place-items: center; aspect-ratio: 6 / 7; overflow: hidden;
-  border-radius: calc(var(--radius) * 0.7);
+  border-radius: calc(var(--_radius) * 0.7);
   background:
     radial-gradient(ellipse 25% 30% at 50% 46%, var(--figure) 98%, transparent),
     radial-gradient(ellipse 47% 20% at 50% 101%, var(--figure) 98%, transparent), var(--tint);
@@ -48,25 +49,25 @@ video {
 .ready .viewfinder, .busy .viewfinder { --outline: #58d68d; }
 .ready .viewfinder::after, .busy .viewfinder::after { border-style: solid; border-width: 4px; }
 .accepted .viewfinder, .rejected .viewfinder {
-  --tone: var(--bad); background: color-mix(in srgb, var(--tone) 14%, var(--surface));
+  --tone: var(--_bad); background: color-mix(in srgb, var(--tone) 14%, var(--_surface));
 }
-.accepted .viewfinder { --tone: var(--good); }
+.accepted .viewfinder { --tone: var(--_good); }
 .accepted .viewfinder::after, .rejected .viewfinder::after { display: none; }
 .accepted .viewfinder::before, .rejected .viewfinder::before {
   content: "✕" / ""; display: grid; place-items: center; width: 6.5rem; height: 6.5rem; border-radius: 50%;
-  background: var(--tone); color: var(--surface); font-size: 3.25rem; line-height: 1; font-weight: 700;
+  background: var(--tone); color: var(--_surface); font-size: 3.25rem; line-height: 1; font-weight: 700;
 }
 .accepted .viewfinder::before { content: "✓" / ""; }
 .status { display: grid; place-items: center; min-height: 2.8em; font-weight: 600; text-wrap: balance; }
 .off .status:empty { min-height: 0; }
-.accepted .status { color: var(--good); }
-.rejected .status, .failed .status { color: var(--bad); }
+.accepted .status { color: var(--_good); }
+.rejected .status, .failed .status { color: var(--_bad); }
 button {
   font: inherit; font-weight: 600; min-height: 3rem; padding: 0.5rem 1.25rem; cursor: pointer;
-  border: 0; border-radius: calc(var(--radius) * 0.6); background: var(--accent); color: var(--on-accent);
+  border: 0; border-radius: calc(var(--_radius) * 0.6); background: var(--_accent); color: var(--_on-accent);
 }
 button:hover:enabled { filter: brightness(1.08); }
-button:focus-visible { outline: 3px solid var(--accent); outline-offset: 3px; }
+button:focus-visible { outline: 3px solid var(--_accent); outline-offset: 3px; }
 button:disabled { cursor: progress; opacity: 0.55; }
 @media (max-height: 38rem) { .viewfinder { aspect-ratio: 1; } }
 @media (prefers-reduced-motion: no-preference) {

@@ -1,16 +1,12 @@
 /** Warp a face onto the common five-point template of ArcFace. */
 
-import { ContractError } from "../errors.js";
+import { unusable } from "../errors.js";
 import type { Point } from "./faces.js";
 import { warpAffine, type Affine, type RgbImage } from "./image.js";
 
 // Left eye, right eye, nose, left and right mouth corner as the viewer sees them, for 112 x 112.
 const TEMPLATE_112: readonly Point[] = [
-  [38.2946, 51.6963],
-  [73.5318, 51.5014],
-  [56.0252, 71.7366],
-  [41.5493, 92.3655],
-  [70.7299, 92.2041],
+  [38.2946, 51.6963], [73.5318, 51.5014], [56.0252, 71.7366], [41.5493, 92.3655], [70.7299, 92.2041],
 ];
 
 export const TEMPLATE_NAME = "arcface-112";
@@ -19,7 +15,7 @@ export const TEMPLATE_NAME = "arcface-112";
 export function template(size: number): Point[] {
   const [ratio, move] = size % 112 === 0 ? [size / 112, 0] : [size / 128, (8 * size) / 128];
   if (size <= 0 || (size % 112 !== 0 && size % 128 !== 0)) {
-    throw new ContractError(`there is no common alignment template for a ${size} x ${size} embedder`);
+    throw unusable(`there is no common alignment template for a ${size} x ${size} embedder`);
   }
   return TEMPLATE_112.map(([x, y]) => [x * ratio + move, y * ratio]);
 }

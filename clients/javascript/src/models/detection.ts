@@ -1,17 +1,9 @@
 /** Face detectors, and which canvas speaks for which face: `models/detection.py`, where the reasons stand. */
 
-import { ContractError } from "../errors.js";
+import { unusable } from "../errors.js";
 import { SCRFD, YUNET, type DetectorFamily } from "./detectors.js";
-import {
-  boxHeight,
-  boxWidth,
-  intersectionOverUnion,
-  longerSide,
-  nonMaximumSuppression,
-  type Box,
-  type Face,
-  type Point,
-} from "./faces.js";
+import { boxHeight, boxWidth, intersectionOverUnion, longerSide, nonMaximumSuppression } from "./faces.js";
+import type { Box, Face, Point } from "./faces.js";
 import { placed, resizeArea, resizeLinear, roundHalfEven, type RgbImage } from "./image.js";
 import { planes, type Graph } from "./runtime.js";
 
@@ -43,7 +35,7 @@ export class Detector {
   ) {
     const family = [YUNET, SCRFD].find(({ isOf }) => isOf(graph.outputNames));
     if (family === undefined) {
-      throw new ContractError("the detector is neither SCRFD with five points nor YuNet");
+      throw unusable("the detector is neither SCRFD with five points nor YuNet");
     }
     this.family = family;
     const [, , height, width] = graph.inputShape;
@@ -122,9 +114,7 @@ export async function findFaces(detector: Detector, image: RgbImage): Promise<Fa
     return onMain.length > 0 ? onMain : insideBorder(detector, image, main);
   }
   const limit = (SMALLEST_NEAR_FACE / Math.max(...near)) * longest;
-  const faces = onMain.filter(
-    (face) => longerSide(face) < limit || (face.score >= sure && !blind),
-  );
+  const faces = onMain.filter((face) => longerSide(face) < limit || (face.score >= sure && !blind));
   for (const face of onNear) if (!among(face, faces)) faces.push(face);
   return faces.sort((a, b) => b.score - a.score);
 }
@@ -184,11 +174,7 @@ function shrunk(image: RgbImage, longest: number): RgbImage {
  * @param enlarge whether a picture smaller than the canvas is enlarged to fill it.
  * @returns the canvas, and canvas pixels per image pixel.
  */
-export function letterbox(
-  image: RgbImage,
-  size: Size,
-  enlarge: boolean,
-): { canvas: RgbImage; scale: number } {
+export function letterbox(image: RgbImage, size: Size, enlarge: boolean): { canvas: RgbImage; scale: number } {
   const ratio = image.height / image.width;
   let [height, width] = [image.height, image.width];
   if (enlarge || height > size[0] || width > size[1]) {

@@ -5,7 +5,7 @@
  * (W. Wu, H. Peng, S. Yu, 2023).
  */
 
-import { ContractError } from "../errors.js";
+import { unusable } from "../errors.js";
 import type { Face, Point } from "./faces.js";
 import type { Tensor } from "./runtime.js";
 
@@ -53,7 +53,7 @@ function decoded(
     const count = Math.floor(size[0] / stride) * columns;
     const cells = cellsOf(stride, count);
     if (cells === undefined) {
-      throw new ContractError(`the detector's outputs at stride ${stride} do not fit its canvas`);
+      throw unusable(`the detector's outputs at stride ${stride} do not fit its canvas`);
     }
     const faces: Face[] = [];
     for (let k = 0; k < count * cells.perCell; k++) {
@@ -98,12 +98,8 @@ export const SCRFD: DetectorFamily = {
         box?.length === 4 * score.length && point?.length === 10 * score.length;
       return fits ? { score: (k) => score[k], box, points: point, perCell } : undefined;
     };
-    return decoded(size, 0.5, cellsOf, (x, y, [left, top, right, bottom], stride) => [
-      x - left * stride,
-      y - top * stride,
-      x + right * stride,
-      y + bottom * stride,
-    ]);
+    return decoded(size, 0.5, cellsOf, (x, y, [left, top, right, bottom], stride) =>
+      [x - left * stride, y - top * stride, x + right * stride, y + bottom * stride]);
   },
 };
 

@@ -1,6 +1,6 @@
 /** Aligned crops → unit embeddings, by an ArcFace-like graph. */
 
-import { ContractError } from "../errors.js";
+import { unusable } from "../errors.js";
 import type { RgbImage } from "./image.js";
 import { planes, type Graph } from "./runtime.js";
 
@@ -21,19 +21,15 @@ export interface Preprocessing {
 export const PREPROCESSING_VERSION = 2;
 
 /** Embed an aligned crop of the preprocessing's size: n values of unit norm. */
-export async function embed(
-  graph: Graph,
-  crop: RgbImage,
-  preprocessing: Preprocessing,
-): Promise<Float32Array> {
-  const sum = await rawOutput(graph, crop, preprocessing);
-  if (preprocessing.flip) {
-    const other = await rawOutput(graph, mirrored(crop), preprocessing);
+export async function embed(graph: Graph, crop: RgbImage, how: Preprocessing): Promise<Float32Array> {
+  const sum = await rawOutput(graph, crop, how);
+  if (how.flip) {
+    const other = await rawOutput(graph, mirrored(crop), how);
     sum.forEach((value, i) => (sum[i] = value + other[i]));
   }
   const norm = Math.sqrt(sum.reduce((total, value) => total + value * value, 0));
   if (!(norm > 0) || !Number.isFinite(norm)) {
-    throw new ContractError("the embedder's output for a crop is zero or not finite");
+    throw unusable("the embedder's output for a crop is zero or not finite");
   }
   return sum.map((value) => value / norm);
 }
@@ -46,7 +42,7 @@ async function rawOutput(graph: Graph, crop: RgbImage, how: Preprocessing): Prom
   blob.set(one);
   const [output] = (await graph.run(blob, [batch, 3, crop.height, crop.width])).values();
   if (output?.dims.length !== 2 || output.dims[0] !== batch) {
-    throw new ContractError("the embedder must give one row of numbers for a crop");
+    throw unusable("the embedder must give one row of numbers for a crop");
   }
   return output.data.slice(0, output.dims[1]);
 }

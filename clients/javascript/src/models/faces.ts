@@ -1,6 +1,6 @@
 /** Detected faces: the value, boxes, and which face of a photo is meant. */
 
-import { PhotoError } from "../errors.js";
+import { VeilfaceError } from "../errors.js";
 
 /** x1, y1, x2, y2 in pixels. */
 export type Box = readonly [number, number, number, number];
@@ -32,14 +32,6 @@ const MAX_CANDIDATES = 1000;
 // As in `models/selection.py`.
 const DOMINANCE = 2;
 const LARGER = 1.25;
-const REMEDIES: Readonly<Record<FacePolicy, string>> = {
-  dominant:
-    ", and none of them is both in the middle and much the largest: come closer, or send " +
-    "face=largest to take the largest face wherever it is.",
-  largest: ", and the largest two are of about the same size: cut the photo to one.",
-  single: "; send one that shows a single face.",
-};
-
 export const boxWidth = (box: Box): number => box[2] - box[0];
 export const boxHeight = (box: Box): number => box[3] - box[1];
 export const shorterSide = ({ box }: Face): number => Math.min(boxWidth(box), boxHeight(box));
@@ -78,13 +70,7 @@ export function selectFace(
   { width, height }: { readonly width: number; readonly height: number },
   least: number,
 ): Face {
-  if (faces.length === 0) {
-    throw new PhotoError(
-      "no_face",
-      "No face was found: hold the photo upright, and come closer, until the face fills a good " +
-        "part of it.",
-    );
-  }
+  if (faces.length === 0) throw new VeilfaceError("no_face", "No face was found.");
   const byArea = [...faces].sort((a, b) => boxArea(b.box) - boxArea(a.box));
   const counted = byArea.filter((face) => shorterSide(face) >= least);
   const [main, other] = counted.length > 0 ? counted : byArea.slice(0, 1);
@@ -94,6 +80,6 @@ export function selectFace(
   const ratio = boxArea(main.box) / boxArea(other.box);
   if (policy === "dominant" && ratio >= DOMINANCE && coversMiddle) return main;
   if (policy === "largest" && ratio >= LARGER) return main;
-  const message = `The photo shows ${counted.length} faces${REMEDIES[policy]}`;
-  throw new PhotoError("multiple_faces", message, { faces: counted.length });
+  const message = `The photo shows ${counted.length} faces, and it is not clear which one is meant.`;
+  throw new VeilfaceError("multiple_faces", message, { details: { faces: counted.length } });
 }

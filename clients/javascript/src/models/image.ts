@@ -1,6 +1,6 @@
 /** Pictures as arrays, and the three ways in which they are resampled, as OpenCV does it. */
 
-import { PhotoError } from "../errors.js";
+import { VeilfaceError } from "../errors.js";
 
 /** A picture: RGB, 8 bits a channel, row by row from the top. */
 export interface RgbImage {
@@ -27,19 +27,16 @@ export function fromImageData(pixels: {
   readonly width: number;
   readonly height: number;
 }): RgbImage {
-  const data = new Uint8Array(3 * pixels.width * pixels.height);
-  for (let from = 0, to = 0; to < data.length; from += 4, to += 3) {
-    data[to] = pixels.data[from];
-    data[to + 1] = pixels.data[from + 1];
-    data[to + 2] = pixels.data[from + 2];
-  }
-  return rgbImage(data, pixels.width, pixels.height);
+  const { data, width, height } = pixels;
+  const rgb = new Uint8Array(3 * width * height);
+  for (let i = 0; i < rgb.length; i++) rgb[i] = data[i + Math.floor(i / 3)];
+  return rgbImage(rgb, width, height);
 }
 
 /**
  * Decode a photo in a browser, upright: the EXIF orientation is applied.
  *
- * Colours stay as they are in the file, as the service reads them. Throws `PhotoError`
+ * Colours stay as they are in the file, as the service reads them. Throws
  * `unsupported_image` of a file that is no picture.
  */
 export async function decodeImage(photo: Blob): Promise<RgbImage> {
@@ -48,17 +45,21 @@ export async function decodeImage(photo: Blob): Promise<RgbImage> {
     colorSpaceConversion: "none",
   }).catch(() => {
     const message = "The file is not a picture that this browser reads; send a JPEG or PNG.";
-    throw new PhotoError("unsupported_image", message);
+    throw new VeilfaceError("unsupported_image", message);
   });
   try {
-    const canvas = new OffscreenCanvas(bitmap.width, bitmap.height);
-    const context = canvas.getContext("2d", { willReadFrequently: true });
-    if (context === null) throw new Error("this browser gives no canvas to decode with");
-    context.drawImage(bitmap, 0, 0);
-    return fromImageData(context.getImageData(0, 0, bitmap.width, bitmap.height));
+    return drawn(bitmap, bitmap.width, bitmap.height);
   } finally {
     bitmap.close();
   }
+}
+
+/** What a canvas shows of a picture, or of a video now. */
+export function drawn(source: ImageBitmap | HTMLVideoElement, width: number, height: number): RgbImage {
+  const context = new OffscreenCanvas(width, height).getContext("2d", { willReadFrequently: true });
+  if (context === null) throw new Error("this browser gives no canvas to read a picture with");
+  context.drawImage(source, 0, 0);
+  return fromImageData(context.getImageData(0, 0, width, height));
 }
 
 /** What one pixel of the result takes along one side: weights of pixels from `start` on. */
@@ -92,13 +93,7 @@ function areaTaps(from: number, to: number): Taps[] {
   });
 }
 
-function resize(
-  image: RgbImage,
-  width: number,
-  height: number,
-  taps: typeof linearTaps,
-  rounding: number,
-): RgbImage {
+function resize(image: RgbImage, width: number, height: number, taps: typeof linearTaps, rounding: number): RgbImage {
   if (width === image.width && height === image.height) return image;
   const columns = taps(image.width, width);
   const data = new Uint8Array(3 * width * height);
@@ -167,13 +162,7 @@ export function warpAffine(image: RgbImage, matrix: Affine, size: number): RgbIm
 }
 
 /** Put a picture into a black one, `top` and `left` pixels from its corner. */
-export function placed(
-  image: RgbImage,
-  width: number,
-  height: number,
-  top = 0,
-  left = 0,
-): RgbImage {
+export function placed(image: RgbImage, width: number, height: number, top = 0, left = 0): RgbImage {
   const data = new Uint8Array(3 * width * height);
   for (let y = 0; y < image.height; y++) {
     const row = image.data.subarray(3 * y * image.width, 3 * (y + 1) * image.width);
@@ -185,7 +174,5 @@ export function placed(
 /** Round to the nearest whole number, halves to the even one, as Python does sizes. */
 export function roundHalfEven(value: number): number {
   const low = Math.floor(value);
-  const share = value - low;
-  if (share !== 0.5) return share < 0.5 ? low : low + 1;
-  return low % 2 === 0 ? low : low + 1;
+  return value - low === 0.5 ? low + Math.abs(low % 2) : Math.round(value);
 }

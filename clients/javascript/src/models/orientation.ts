@@ -1,6 +1,6 @@
 /** Which way up a photo is: as in `models/detection.py`, where the reasons stand. */
 
-import { PhotoError } from "../errors.js";
+import { VeilfaceError } from "../errors.js";
 import type { Detector, Size } from "./detection.js";
 import type { Face } from "./faces.js";
 import { resizeArea, type RgbImage } from "./image.js";
@@ -37,9 +37,6 @@ export async function requireUpright(detector: Detector, face: Face, crop: RgbIm
   if (face.score >= detector.family.clearScore) return;
   const turns = await quarterTurns(detector, crop);
   if (turns === 0) return;
-  const message =
-    turns === 2
-      ? "The photo is upside down: turn it."
-      : "The photo lies on its side: hold it upright.";
-  throw new PhotoError("low_quality", message, { turned: { value: 90 * turns, limit: 0 } });
+  const message = turns === 2 ? "The photo is upside down: turn it." : "The photo lies on its side: hold it upright.";
+  throw new VeilfaceError("low_quality", message, { details: { turned: { value: 90 * turns, limit: 0 } } });
 }

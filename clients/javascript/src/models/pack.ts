@@ -1,11 +1,11 @@
 /** The graphs of a contract, which together turn a photo into an embedding. */
 
 import { concealed, sha256 } from "../bytes.js";
-import { ContractError, PhotoError } from "../errors.js";
+import { isPhotoRefused, unusable, type VeilfaceError } from "../errors.js";
 import { align, TEMPLATE_NAME } from "./alignment.js";
 import { DEFAULT_SIZE, Detector, findFaces, type Size } from "./detection.js";
 import { embed, PREPROCESSING_VERSION, type Preprocessing } from "./embedding.js";
-import { selectFace, type Box, type Face, type FacePolicy } from "./faces.js";
+import { selectFace, type Face, type FacePolicy } from "./faces.js";
 import { resizeArea, resizeLinear, type RgbImage } from "./image.js";
 import { requireUpright } from "./orientation.js";
 import { measure, QUALITY_LIMITS, requireQuality, type Quality } from "./quality.js";
@@ -29,19 +29,6 @@ export interface PackGraphs {
   readonly embedder: Uint8Array;
   /** Absent where the contract names none: photos are then aligned crops. */
   readonly detector?: Uint8Array;
-}
-
-/** Whether a photo would do: what `POST /v1/photos/check` answers of one. */
-export interface PhotoCheck {
-  readonly usable: boolean;
-  /** Why not, as in the REST contract; null if it is usable. */
-  readonly code: string | null;
-  readonly message: string;
-  readonly details: Readonly<Record<string, unknown>>;
-  /** Of the face, in pixels of the upright photo; null if it is not usable, or came aligned. */
-  readonly box: Box | null;
-  /** What was measured; null if it is not usable. */
-  readonly quality: Quality | null;
 }
 
 /** One face of a photo. Printing it shows no pixel, and no number of the embedding. */
@@ -68,7 +55,7 @@ export class ModelPack {
    *
    * @param runtime the module `onnxruntime-web` or `onnxruntime-node`.
    * @param options of ONNX Runtime's session, such as `{ executionProviders: ["webgpu", "wasm"] }`.
-   * @throws ContractError if a graph is not that of the contract, or cannot be used.
+   * @throws `unusable_contract` if a graph is not that of the contract, or cannot be used.
    */
   static async load(
     runtime: Runtime,
@@ -79,10 +66,10 @@ export class ModelPack {
     const { binding, recorded } = contract;
     const { alignment, version } = binding.preprocessing;
     if (alignment !== TEMPLATE_NAME || version !== PREPROCESSING_VERSION) {
-      throw new ContractError("this client does not go the contract's way from a photo to its crop");
+      throw unusable("this client does not go the contract's way from a photo to its crop");
     }
     if ((recorded.detector_sha256 === undefined) !== (graphs.detector === undefined)) {
-      throw new ContractError("the pack has a detector and the contract none, or the other way round");
+      throw unusable("the pack has a detector and the contract none, or the other way round");
     }
     await requireSha256("embedder", graphs.embedder, binding.embedder_sha256);
     if (graphs.detector) await requireSha256("detector", graphs.detector, recorded.detector_sha256);
@@ -99,32 +86,27 @@ export class ModelPack {
     }
   }
 
-  /** Whether a photo would do, and where its face is; nothing is embedded. */
-  async checkPhoto(image: RgbImage, policy?: FacePolicy): Promise<PhotoCheck> {
+  /** Why a photo will not do, or undefined; nothing is embedded. */
+  async checkPhoto(image: RgbImage, policy?: FacePolicy): Promise<VeilfaceError | undefined> {
     try {
-      const { face, quality } = await this.#crop(image, policy);
-      const message =
-        face === undefined
-          ? "an aligned crop of a face, clear enough"
-          : "one face, large and clear enough";
-      return { usable: true, code: null, message, details: {}, box: face?.box ?? null, quality };
+      await this.#crop(image, policy);
+      return undefined;
     } catch (error) {
-      if (!(error instanceof PhotoError)) throw error;
-      const { code, message, details } = error;
-      return { usable: false, code, message, details, box: null, quality: null };
+      if (isPhotoRefused(error)) return error;
+      throw error;
     }
   }
 
   /**
    * From a photo to the embedding of its face.
    *
-   * @throws PhotoError `no_face`, `multiple_faces`, `face_too_small` or `low_quality`.
+   * @throws `no_face`, `multiple_faces`, `face_too_small` or `low_quality`.
    */
   async embedPhoto(image: RgbImage, policy?: FacePolicy): Promise<FaceSample> {
     const taken = await this.#crop(image, policy);
     const embedding = await embed(this.embedder, taken.crop, this.binding.preprocessing);
     if (embedding.length !== this.binding.n) {
-      throw new ContractError(`the embedder gives ${embedding.length} numbers, not ${this.binding.n}`);
+      throw unusable(`the embedder gives ${embedding.length} numbers, not ${this.binding.n}`);
     }
     return concealed({ ...taken, embedding }, "crop", "embedding");
   }
@@ -136,10 +118,7 @@ export class ModelPack {
   }
 
   /** Find the face that is meant, align it, and check its quality. */
-  async #crop(
-    image: RgbImage,
-    policy: FacePolicy = "dominant",
-  ): Promise<Omit<FaceSample, "embedding">> {
+  async #crop(image: RgbImage, policy: FacePolicy = "dominant"): Promise<Omit<FaceSample, "embedding">> {
     const { size } = this.binding.preprocessing;
     const { detector } = this;
     let face: Face | undefined;
@@ -157,18 +136,13 @@ export class ModelPack {
   }
 }
 
-async function requireSha256(
-  what: string,
-  bytes: Uint8Array,
-  expected: string | undefined,
-): Promise<void> {
+async function requireSha256(what: string, bytes: Uint8Array, expected = "none"): Promise<void> {
   const seen = await sha256(bytes);
-  if (seen !== expected) {
-    throw new ContractError(
-      `the ${what} has the SHA-256 ${seen.slice(0, 16)}…, the contract names ` +
-        `${String(expected).slice(0, 16)}…: use the pack that the contract was calibrated with`,
-    );
-  }
+  if (seen === expected) return;
+  throw unusable(
+    `the ${what} has the SHA-256 ${seen.slice(0, 16)}…, the contract names ${expected.slice(0, 16)}…: ` +
+      "use the pack that the contract was calibrated with",
+  );
 }
 
 /** Take a square picture as an aligned crop, resized to the embedder's size. */

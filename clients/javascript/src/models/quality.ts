@@ -1,6 +1,6 @@
 /** Is this face good enough to enroll or to verify? Measures, limits, and named refusals. */
 
-import { PhotoError } from "../errors.js";
+import { VeilfaceError } from "../errors.js";
 import { similarityTransform, template } from "./alignment.js";
 import { boxHeight, boxWidth, shorterSide, type Face, type Point } from "./faces.js";
 import { resizeArea, type RgbImage } from "./image.js";
@@ -15,28 +15,6 @@ const EYES_PER_NOSE = 1.41;
 const HEIGHT_PER_NOSE = 3.26;
 const NEUTRAL_NOSE = 0.545;
 
-/** What was measured on one face; null for crops that came aligned. */
-export interface Quality {
-  /** Confidence of the detector, 0…1. */
-  readonly score: number | null;
-  /** Shorter side of the detected box in pixels. */
-  readonly face_size: number | null;
-  /** Fine detail of the aligned crop: about 3 for a sharp photo, below 0.5 for a useless one. */
-  readonly sharpness: number;
-  /** Mean luma of the centre of the aligned crop, 0…255. */
-  readonly brightness: number;
-  /** Luma that a twentieth of the whole picture exceeds, 0…255. */
-  readonly exposure: number;
-  /** Degrees. */
-  readonly yaw: number | null;
-  readonly pitch: number | null;
-  readonly roll: number | null;
-  /** Least distance of the five points from the picture's border, over the aligned crop's side. */
-  readonly border: number | null;
-  /** Height of the detected box over its width. */
-  readonly aspect: number | null;
-}
-
 /** What a face must reach, by what is measured. */
 export const QUALITY_LIMITS = {
   face_size: 24,
@@ -50,26 +28,42 @@ export const QUALITY_LIMITS = {
   aspect: 1.7,
 } as const;
 
+/** What was measured on one face; what is of the detected face is null for crops that came aligned. */
+export type Quality = ReturnType<typeof measure>;
+
 /** Measure the aligned crop of a face in `image`; `face` is undefined for crops that came aligned. */
-export function measure(crop: RgbImage, face: Face | undefined, image: RgbImage): Quality {
+export function measure(crop: RgbImage, face: Face | undefined, image: RgbImage) {
   const grey = greyCrop(crop);
-  let brightness = 0;
-  for (let y = MARGIN; y < SIDE - MARGIN; y++) {
-    for (let x = MARGIN; x < SIDE - MARGIN; x++) brightness += grey[y * SIDE + x];
-  }
-  const pose = face === undefined ? undefined : measurePose(face.keypoints);
+  const pose = face && measurePose(face.keypoints);
   return {
+    /** Confidence of the detector, 0…1. */
     score: face?.score ?? null,
-    face_size: face === undefined ? null : shorterSide(face),
+    /** Shorter side of the detected box in pixels. */
+    face_size: face ? shorterSide(face) : null,
+    /** Fine detail of the aligned crop: about 3 for a sharp photo, below 0.5 for a useless one. */
     sharpness: measureSharpness(grey),
-    brightness: brightness / (SIDE - 2 * MARGIN) ** 2,
+    /** Mean luma of the centre of the aligned crop, 0…255. */
+    brightness: meanOfCentre((at) => grey[at]),
+    /** Luma that a twentieth of the whole picture exceeds, 0…255. */
     exposure: measureExposure(image),
+    /** Degrees. */
     yaw: pose?.yaw ?? null,
     pitch: pose?.pitch ?? null,
     roll: pose?.roll ?? null,
-    border: face === undefined ? null : measureBorder(face.keypoints, image),
-    aspect: face === undefined ? null : boxHeight(face.box) / boxWidth(face.box),
+    /** Least distance of the five points from the picture's border, over the aligned crop's side. */
+    border: face ? measureBorder(face.keypoints, image) : null,
+    /** Height of the detected box over its width. */
+    aspect: face ? boxHeight(face.box) / boxWidth(face.box) : null,
   };
+}
+
+/** Mean over the pixels of the crop's centre. */
+function meanOfCentre(of: (at: number) => number): number {
+  let sum = 0;
+  for (let y = MARGIN; y < SIDE - MARGIN; y++) {
+    for (let x = MARGIN; x < SIDE - MARGIN; x++) sum += of(y * SIDE + x);
+  }
+  return sum / (SIDE - 2 * MARGIN) ** 2;
 }
 
 function measureExposure({ data, width, height }: RgbImage): number {
@@ -104,27 +98,13 @@ function greyCrop(crop: RgbImage): Float64Array {
  */
 export function measureSharpness(grey: Float64Array): number {
   const smooth = blurred(grey);
-  const inner = SIDE - 2 * MARGIN;
-  const count = inner * inner;
-  const mean = (of: (at: number) => number): number => {
-    let sum = 0;
-    for (let y = MARGIN; y < SIDE - MARGIN; y++) {
-      for (let x = MARGIN; x < SIDE - MARGIN; x++) sum += of(y * SIDE + x);
-    }
-    return sum / count;
-  };
-  const level = mean((at) => smooth[at]);
-  const variance = mean((at) => (smooth[at] - level) ** 2);
+  const level = meanOfCentre((at) => smooth[at]);
+  const variance = meanOfCentre((at) => (smooth[at] - level) ** 2);
   if (variance < 1e-6) return 0;
   // Diagonal neighbours are sqrt(2) apart, which doubles a second difference.
-  const directions = [
-    [1, 1],
-    [SIDE, 1],
-    [SIDE + 1, 0.5],
-    [SIDE - 1, 0.5],
-  ];
+  const directions = [[1, 1], [SIDE, 1], [SIDE + 1, 0.5], [SIDE - 1, 0.5]];
   const energies = directions.map(([step, weight]) =>
-    mean((at) => ((smooth[at - step] - 2 * smooth[at] + smooth[at + step]) * weight) ** 2),
+    meanOfCentre((at) => ((smooth[at - step] - 2 * smooth[at] + smooth[at + step]) * weight) ** 2),
   );
   return (1000 * Math.min(...energies)) / variance;
 }
@@ -151,11 +131,7 @@ function blurred(grey: Float64Array): Float64Array {
 }
 
 /** Yaw, pitch and roll of a face from its five points, in degrees; good to about 10. */
-export function measurePose(keypoints: readonly Point[]): {
-  yaw: number;
-  pitch: number;
-  roll: number;
-} {
+export function measurePose(keypoints: readonly Point[]): { yaw: number; pitch: number; roll: number } {
   const [a, b, x0, c, d, y0] = similarityTransform(keypoints, template(SIDE));
   const [left, right, nose, mouthLeft, mouthRight] = keypoints.map(([x, y]): Point => [
     a * x + b * y + x0,
@@ -177,16 +153,6 @@ export function measurePose(keypoints: readonly Point[]): {
   };
 }
 
-const REMEDIES: Readonly<Record<string, string>> = {
-  score: "Show the face unobstructed.",
-  blur: "Hold the camera still and focus on the face.",
-  darkness: "Put more light on the face.",
-  brightness: "Put less light on the face.",
-  turned: "Hold the photo upright.",
-  pose: "Look into the camera.",
-  hidden: "Show the whole face, with nothing before it and some room around it.",
-};
-
 /**
  * Refuse a face that fails a limit, by `face_too_small` or by `low_quality`, which names every one.
  *
@@ -196,17 +162,15 @@ export function requireQuality(quality: Quality, leastScore: number): void {
   const limits = QUALITY_LIMITS;
   const size = quality.face_size;
   if (size !== null && size < limits.face_size) {
-    throw new PhotoError(
+    throw new VeilfaceError(
       "face_too_small",
-      `The face is ${size.toFixed(0)} pixels wide; at least ${limits.face_size} are needed. ` +
-        "Come closer or send a larger photo.",
-      { size: measured(size, limits.face_size) },
+      `The face is ${size.toFixed(0)} pixels wide; at least ${limits.face_size} are needed.`,
+      { details: { size: measured(size, limits.face_size) } },
     );
   }
   const { score, sharpness, brightness, exposure, yaw, pitch, roll, border, aspect } = quality;
   const below = (value: number | null, limit: number): boolean => value !== null && value < limit;
-  const beyond = (value: number | null, limit: number): boolean =>
-    value !== null && Math.abs(value) > limit;
+  const beyond = (value: number | null, limit: number): boolean => value !== null && Math.abs(value) > limit;
   const [darkest, brightest] = limits.brightness;
   const checks: readonly [string, string | null, number | null, number, boolean][] = [
     ["score", null, score, leastScore, below(score, leastScore)],
@@ -229,9 +193,7 @@ export function requireQuality(quality: Quality, leastScore: number): void {
   }
   const names = Object.keys(failed);
   if (names.length === 0) return;
-  const remedies = names.map((name) => REMEDIES[name]).join(" ");
-  const message = `The photo is not good enough (${names.join(", ")}). ${remedies}`;
-  throw new PhotoError("low_quality", message, failed);
+  throw new VeilfaceError("low_quality", `The photo is not good enough (${names.join(", ")}).`, { details: failed });
 }
 
 const measured = (value: number, limit: number): { value: number; limit: number } => ({

@@ -1,6 +1,6 @@
 /** What is used of ONNX Runtime: the caller gives its module, so that this package bundles none. */
 
-import { ContractError } from "../errors.js";
+import { unusable } from "../errors.js";
 
 /** The module `onnxruntime-web` or `onnxruntime-node`. */
 export interface Runtime {
@@ -16,10 +16,7 @@ export interface RuntimeSession {
   readonly outputNames: readonly string[];
   /** Shape of each input, a text for a size that is open; ONNX Runtime 1.22 and later. */
   readonly inputMetadata: readonly unknown[];
-  run(
-    feeds: Readonly<Record<string, unknown>>,
-    options?: object,
-  ): Promise<Readonly<Record<string, unknown>>>;
+  run(feeds: object, options?: object): Promise<Readonly<Record<string, unknown>>>;
   release(): Promise<void>;
 }
 
@@ -41,22 +38,20 @@ export class Graph {
     readonly inputShape: readonly (number | undefined)[],
   ) {}
 
-  /** Load a graph; throws `ContractError` where it is none, or has another input than one image. */
+  /** Load a graph; throws `unusable_contract` where it is none, or has another input than one image. */
   static async load(runtime: Runtime, bytes: Uint8Array, options?: object): Promise<Graph> {
     let session: RuntimeSession;
     try {
       session = await runtime.InferenceSession.create(bytes, { ...ERRORS_ONLY, ...options });
     } catch (error) {
-      throw new ContractError(`ONNX Runtime does not load a graph of the pack: ${String(error)}`);
+      throw unusable(`ONNX Runtime does not load a graph of the pack: ${String(error)}`);
     }
     const input = session.inputMetadata?.[0] as { shape?: readonly unknown[] } | undefined;
     if (session.inputNames.length !== 1 || input?.shape?.length !== 4) {
       await session.release();
-      throw new ContractError("a graph of the pack has not one image input, or ONNX Runtime is too old");
+      throw unusable("a graph of the pack has not one image input, or ONNX Runtime is too old");
     }
-    const shape = input.shape.map((size) =>
-      typeof size === "number" && size > 0 ? size : undefined,
-    );
+    const shape = input.shape.map((size) => (typeof size === "number" && size > 0 ? size : undefined));
     return new Graph(runtime, session, shape);
   }
 
@@ -67,13 +62,12 @@ export class Graph {
   /** Run on a batch of images; the outputs by their names. */
   async run(data: Float32Array, dims: readonly number[]): Promise<Map<string, Tensor>> {
     const input = new this.runtime.Tensor("float32", data, dims);
-    let outputs: Readonly<Record<string, unknown>>;
     try {
-      outputs = await this.session.run({ [this.session.inputNames[0]]: input }, ERRORS_ONLY);
+      const outputs = await this.session.run({ [this.session.inputNames[0]]: input }, ERRORS_ONLY);
+      return new Map(this.outputNames.map((name) => [name, outputs[name] as Tensor]));
     } catch (error) {
-      throw new ContractError(`ONNX Runtime does not run a graph of the pack: ${String(error)}`);
+      throw unusable(`ONNX Runtime does not run a graph of the pack: ${String(error)}`);
     }
-    return new Map(this.outputNames.map((name) => [name, outputs[name] as Tensor]));
   }
 
   /** Free what ONNX Runtime holds. */
@@ -93,11 +87,9 @@ export function planes(
   const out = new Float32Array(3 * count);
   for (let channel = 0; channel < 3; channel++) {
     const from = order === "rgb" ? channel : 2 - channel;
-    const start = channel * count;
-    const less = Math.fround(mean[channel]);
-    const times = Math.fround(factor[channel]);
+    const [less, times] = [Math.fround(mean[channel]), Math.fround(factor[channel])];
     for (let i = 0; i < count; i++) {
-      out[start + i] = Math.fround(image.data[3 * i + from] - less) * times;
+      out[channel * count + i] = Math.fround(image.data[3 * i + from] - less) * times;
     }
   }
   return out;

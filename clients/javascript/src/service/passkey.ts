@@ -3,7 +3,7 @@
  * as on the service's own page (docs/javascript.md "The holder key").
  */
 
-import { PasskeyError } from "../errors.js";
+import { VeilfaceError } from "../errors.js";
 
 // With another label every passkey would give another key.
 const LABEL = "Veilface holder key 1: ";
@@ -21,22 +21,15 @@ const labelled = (subject: string): Uint8Array<ArrayBuffer> =>
 const saltOf = async (subject: string): Promise<Uint8Array<ArrayBuffer>> =>
   new Uint8Array(await crypto.subtle.digest("SHA-256", labelled(subject)));
 
-const unsupported = (): PasskeyError =>
-  new PasskeyError(
-    "passkey_unsupported",
-    "This passkey, or this browser, cannot make a key (no PRF extension).",
-  );
+const unsupported = (why = "This passkey, or this browser, cannot make a key (no PRF extension)."): VeilfaceError =>
+  new VeilfaceError("passkey_unsupported", why);
 
 /** Make a passkey for a subject, under the name of the page's host. Earlier ones stay. */
 export async function createPasskey(subject: string, signal: AbortSignal): Promise<Passkey> {
   const publicKey: PublicKeyCredentialCreationOptions = {
     rp: { name: location.hostname },
     // Ends in the salt, by which a passkey of another subject is known.
-    user: {
-      id: Uint8Array.of(...random(16), ...(await saltOf(subject))),
-      name: subject,
-      displayName: subject,
-    },
+    user: { id: Uint8Array.of(...random(16), ...(await saltOf(subject))), name: subject, displayName: subject },
     // Nobody checks a signature: what counts is the key.
     challenge: random(32),
     pubKeyCredParams: [-7, -257].map((alg) => ({ type: "public-key", alg })),
@@ -49,11 +42,7 @@ export async function createPasskey(subject: string, signal: AbortSignal): Promi
 }
 
 /** Compute the holder key, 32 bytes, by the passkey `made`, or by one that the person chooses. */
-export async function passkeyHolderKey(
-  subject: string,
-  signal: AbortSignal,
-  made?: Passkey,
-): Promise<Uint8Array> {
+export async function passkeyHolderKey(subject: string, signal: AbortSignal, made?: Passkey): Promise<Uint8Array> {
   const salt = await saltOf(subject);
   const publicKey: PublicKeyCredentialRequestOptions = {
     challenge: random(32),
@@ -64,17 +53,12 @@ export async function passkeyHolderKey(
   const used = await prompted(() => navigator.credentials.get({ publicKey, signal }));
   const { userHandle } = used.response as AuthenticatorAssertionResponse;
   if (userHandle && String(new Uint8Array(userHandle).slice(-32)) !== String(salt)) {
-    throw new PasskeyError("passkey_of_another", `This passkey is not for ${subject}.`);
+    throw new VeilfaceError("passkey_of_another", `This passkey is not for ${subject}.`);
   }
   const secret = used.getClientExtensionResults().prf?.results?.first;
   if (secret === undefined) throw unsupported();
   const material = await crypto.subtle.importKey("raw", secret, "HKDF", false, ["deriveBits"]);
-  const how = {
-    name: "HKDF",
-    hash: "SHA-256",
-    salt: new Uint8Array(32),
-    info: labelled(subject),
-  };
+  const how = { name: "HKDF", hash: "SHA-256", salt: new Uint8Array(32), info: labelled(subject) };
   return new Uint8Array(await crypto.subtle.deriveBits(how, material, 256));
 }
 
@@ -89,7 +73,7 @@ export function whyNoPasskey(): string | undefined {
 
 async function prompted(ask: () => Promise<Credential | null>): Promise<PublicKeyCredential> {
   const why = whyNoPasskey();
-  if (why !== undefined) throw new PasskeyError("passkey_unsupported", why);
+  if (why !== undefined) throw unsupported(why);
   let used: Credential | null = null;
   try {
     used = await ask();
@@ -99,10 +83,7 @@ async function prompted(ask: () => Promise<Credential | null>): Promise<PublicKe
     if (name !== "NotAllowedError") throw unsupported();
   }
   if (used === null) {
-    throw new PasskeyError(
-      "passkey_refused",
-      "No passkey was used: cancelled, timed out, or there is none here.",
-    );
+    throw new VeilfaceError("passkey_refused", "No passkey was used: cancelled, timed out, or there is none here.");
   }
   return used as PublicKeyCredential;
 }

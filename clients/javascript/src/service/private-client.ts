@@ -2,27 +2,18 @@
 
 import type { Decision, Enrollment } from "../answers.js";
 import { base64, concealed } from "../bytes.js";
-import { PhotoError, UnexpectedAnswer, VeilfaceError } from "../errors.js";
+import { isPhotoRefused, VeilfaceError } from "../errors.js";
 import type { FacePolicy } from "../models/faces.js";
 import { decodeImage, type RgbImage } from "../models/image.js";
-import { ModelPack, type PackGraphs, type PhotoCheck } from "../models/pack.js";
+import { ModelPack, type PackGraphs } from "../models/pack.js";
 import type { Runtime } from "../models/runtime.js";
 import { liftTemplate, requireContract, type PublicContract } from "../templates/contract.js";
 import { DecoyGenerator } from "../templates/generator.js";
-import {
-  ENROLL_PHOTOS,
-  given,
-  keyField,
-  PROBE_PHOTOS,
-  requirePhotos,
-  Session,
-  subjectPath,
-  type EnrollOptions,
-  type VerifyOptions,
-} from "./client.js";
+import { given, keyField, Session, subjectPath, type EnrollOptions, type VerifyOptions } from "./client.js";
 import type { ClientOptions } from "./sending.js";
 
 const LOOKS = 3;
+const MOST_PHOTOS = { enrollment: 10, probe: 5 };
 
 /** A picture; in a browser also a file of one. */
 export type Photo = RgbImage | Blob;
@@ -52,51 +43,24 @@ export class Lift {
   }
 }
 
-/** What one contract lifts with. Its lifts run one after the other, and it is freed after the last. */
-class Lifter {
-  #last: Promise<unknown> = Promise.resolve();
-
-  constructor(
-    readonly contract: PublicContract,
-    readonly generator: DecoyGenerator,
-    readonly pack: ModelPack,
-  ) {}
-
-  use<T>(work: (lifter: Lifter) => Promise<T>): Promise<T> {
-    const result = this.#last.then(() => work(this));
-    this.#last = result.catch(() => undefined);
-    return result;
-  }
-
-  free(): Promise<void> {
-    return this.use(({ pack }) => pack.release());
-  }
+/** What one contract lifts with. */
+interface Lifter {
+  readonly contract: PublicContract;
+  readonly generator: DecoyGenerator;
+  readonly pack: ModelPack;
 }
 
 /** Embeds and lifts here, and sends private templates only. Rights: `embeddings` beside the call's. */
 export class PrivateClient extends Session {
   readonly #options: PrivateOptions;
-  // One for this client and those that `as` made of it.
-  #shared: { clients: number; lifter: Promise<Lifter> | undefined };
+  #lifter: Lifter | undefined;
+  // ONNX Runtime does one thing at a time: what is asked for waits for what was asked for before.
+  #last: Promise<unknown> = Promise.resolve();
   #isClosed = false;
 
   constructor(url: string, bearer: string, options: PrivateOptions) {
     super(url, bearer, options);
     this.#options = options;
-    this.#shared = { clients: 1, lifter: undefined };
-  }
-
-  /**
-   * A client under another bearer, such as the next token, with what this one has fetched or will.
-   *
-   * Close both: what ONNX Runtime holds is freed with the last of them.
-   */
-  as(bearer: string): PrivateClient {
-    this.#requireOpen();
-    const other = new PrivateClient(this.url, bearer, this.#options);
-    other.#shared = this.#shared;
-    this.#shared.clients++;
-    return other;
   }
 
   /** Fetch contract, generator and graphs now, so that the first lift need not wait for them. */
@@ -104,14 +68,13 @@ export class PrivateClient extends Session {
     await this.#with(async () => undefined);
   }
 
-  /** Whether a photo would do, for guidance before a camera; nothing is embedded or sent of it. */
-  async check(photo: Photo, { face }: { face?: FacePolicy } = {}): Promise<PhotoCheck> {
+  /** Say why a photo will not do, or undefined: guidance before a camera, of which nothing is embedded or sent. */
+  async check(photo: Photo, { face }: { face?: FacePolicy } = {}): Promise<VeilfaceError | undefined> {
     return this.#with(async ({ pack }) => pack.checkPhoto(await imageOf(photo), face));
   }
 
   /** Lift a probe; nothing is sent of it. */
   async lift(photos: readonly Photo[], { face }: { face?: FacePolicy } = {}): Promise<Lift> {
-    requirePhotos(photos, PROBE_PHOTOS);
     return this.#lifted("probe", photos, face);
   }
 
@@ -121,7 +84,6 @@ export class PrivateClient extends Session {
    * Never enroll the same photos twice: two lifts of them give the embedding away.
    */
   async liftEnrollment(photos: readonly Photo[], { face }: { face?: FacePolicy } = {}): Promise<Lift> {
-    requirePhotos(photos, ENROLL_PHOTOS);
     return this.#lifted("enrollment", photos, face);
   }
 
@@ -129,48 +91,44 @@ export class PrivateClient extends Session {
    * Lift photos here (or take a lift of {@link liftEnrollment}), and enroll by it alone.
    *
    * After an error repeat with its `lift`, never with the photos.
+   *
+   * @param options.token for this call, in the place of the client's bearer.
    */
   async enroll(
     subject: string,
     photos: readonly Photo[] | Lift,
-    options: EnrollOptions = {},
+    options: EnrollOptions & { readonly token?: string } = {},
   ): Promise<Enrollment> {
     subjectPath(subject);
-    const { holderKey, replace } = options;
-    return this.#send(
-      photos instanceof Lift ? photos : () => this.liftEnrollment(photos, options),
-      (template) => this.putEnrollment(subject, replace, { template, ...keyField(holderKey) }),
+    const { holderKey, replace, token } = options;
+    const lift = photos instanceof Lift ? photos : await this.liftEnrollment(photos, options);
+    return this.#sending(lift, (template) =>
+      this.putEnrollment(subject, replace, given({ template, ...keyField(holderKey) }), token),
     );
   }
 
-  /** Lift photos here (or take a probe of {@link lift}), and verify by it alone. */
+  /** Lift photos here (or take a probe of {@link lift}), and verify by it alone; `token` as for {@link enroll}. */
   async verify(
     subject: string,
     photos: readonly Photo[] | Lift,
-    options: VerifyOptions = {},
+    options: VerifyOptions & { readonly token?: string } = {},
   ): Promise<Decision> {
     subjectPath(subject);
-    const { level, holderKey } = options;
-    return this.#send(
-      photos instanceof Lift ? photos : () => this.lift(photos, options),
-      (template) => this.postProbe(subject, given({ template, level, ...keyField(holderKey) })),
+    const { level, holderKey, token } = options;
+    const lift = photos instanceof Lift ? photos : await this.lift(photos, options);
+    return this.#sending(lift, (template) =>
+      this.postProbe(subject, given({ template, level, ...keyField(holderKey) }), token),
     );
   }
 
-  /** Free what ONNX Runtime holds, where no other client and no lift needs it. */
+  /** Free what ONNX Runtime holds, after what goes on. */
   async close(): Promise<void> {
-    if (this.#isClosed) return;
     this.#isClosed = true;
-    if (--this.#shared.clients === 0) await this.#forget();
+    await this.#forget();
   }
 
-  #requireOpen(): void {
-    if (this.#isClosed) throw new Error("this client was closed: make another one");
-  }
-
-  /** Send a lift, or what is lifted now; an error has the lift, to repeat the call with. */
-  async #send<T>(lifting: Lift | (() => Promise<Lift>), send: (template: string) => Promise<T>): Promise<T> {
-    const lift = lifting instanceof Lift ? lifting : await lifting();
+  /** Send a lift; an error has it, to repeat the call with. */
+  async #sending<T>(lift: Lift, send: (template: string) => Promise<T>): Promise<T> {
     try {
       return await send(base64(lift.template));
     } catch (error) {
@@ -182,27 +140,27 @@ export class PrivateClient extends Session {
     }
   }
 
-  /** Have the next lift fetch the contract in force. */
-  async #forget(): Promise<void> {
-    const { lifter } = this.#shared;
-    this.#shared.lifter = undefined;
-    // A preparation that failed holds nothing, and its error is that of its caller.
-    await (await lifter?.catch(() => undefined))?.free();
+  #inTurn<T>(work: () => Promise<T>): Promise<T> {
+    const result = this.#last.then(work);
+    this.#last = result.catch(() => undefined);
+    return result;
   }
 
-  async #with<T>(work: (lifter: Lifter) => Promise<T>): Promise<T> {
-    this.#requireOpen();
-    const fetching = (this.#shared.lifter ??= this.#fetched());
-    let lifter: Lifter;
-    try {
-      lifter = await fetching;
-    } catch (error) {
-      // What failed to come is fetched again by the next lift.
-      if (this.#shared.lifter === fetching) this.#shared.lifter = undefined;
-      throw error;
-    }
-    this.#requireOpen();
-    return lifter.use(work);
+  #with<T>(work: (lifter: Lifter) => Promise<T>): Promise<T> {
+    return this.#inTurn(async () => {
+      if (this.#isClosed) throw new Error("this client was closed: make another one");
+      this.#lifter ??= await this.#fetched();
+      return work(this.#lifter);
+    });
+  }
+
+  /** Have the next lift fetch the contract in force. */
+  #forget(): Promise<void> {
+    return this.#inTurn(async () => {
+      const lifter = this.#lifter;
+      this.#lifter = undefined;
+      await lifter?.pack.release();
+    });
   }
 
   async #fetched(): Promise<Lifter> {
@@ -215,20 +173,24 @@ export class PrivateClient extends Session {
       const graphs = await (this.#options.graphs?.(contract) ?? this.pack());
       const { runtime, sessionOptions } = this.#options;
       const pack = await ModelPack.load(runtime, contract, graphs, sessionOptions);
-      return new Lifter(contract, generator, pack);
+      return { contract, generator, pack };
     }
-    throw new UnexpectedAnswer("the generator of the service is not that of its contract");
+    throw new VeilfaceError("unexpected_answer", "the generator of the service is not that of its contract");
   }
 
   #lifted(kind: Lift["kind"], photos: readonly Photo[], face: FacePolicy | undefined): Promise<Lift> {
+    const most = MOST_PHOTOS[kind];
+    if (photos.length < 1 || photos.length > most) {
+      throw new RangeError(`1 to ${most} photos are taken, not ${photos.length}`);
+    }
     return this.#with(async ({ contract, generator, pack }) => {
       const embeddings: Float32Array[] = [];
       for (const [index, photo] of photos.entries()) {
-        this.sender.signal?.throwIfAborted();
+        this.signal?.throwIfAborted();
         try {
           embeddings.push((await pack.embedPhoto(await imageOf(photo), face)).embedding);
         } catch (error) {
-          if (error instanceof PhotoError) error.image = index;
+          if (isPhotoRefused(error)) error.image = index;
           throw error;
         }
       }

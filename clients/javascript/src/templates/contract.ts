@@ -2,17 +2,14 @@
 
 import type { components } from "../openapi.js";
 import { sha256 } from "../bytes.js";
-import { ContractError } from "../errors.js";
+import { unusable } from "../errors.js";
 import type { PackContract } from "../models/pack.js";
 import type { DecoyGenerator } from "./generator.js";
 import { lift, meanEmbedding, type Strategy } from "./lifting.js";
 import { encode } from "./subspace.js";
 
 /** The answer of `GET /v1/contract`, with what a client reads of its open members. */
-export type PublicContract = Omit<
-  components["schemas"]["ContractAnswer"],
-  "binding" | "recorded" | "calibrations"
-> &
+export type PublicContract = Omit<components["schemas"]["ContractAnswer"], "binding" | "recorded" | "calibrations"> &
   PackContract & {
     readonly binding: {
       readonly strategy: Strategy;
@@ -27,21 +24,18 @@ export type PublicContract = Omit<
  * Refuse a contract that is not what its id hashes, and a generator other than the contract's or
  * of another embedding space, whose decoys would hide nothing.
  */
-export async function requireContract(
-  contract: PublicContract,
-  generator: DecoyGenerator,
-): Promise<void> {
+export async function requireContract(contract: PublicContract, generator: DecoyGenerator): Promise<void> {
   const { binding } = contract;
   if ((await digest(binding)) !== contract.contract_id) {
-    throw new ContractError("the contract_id is not the hash of the binding");
+    throw unusable("the contract_id is not the hash of the binding");
   }
   if (generator.sourceId !== binding.decoy_source_id || generator.k !== binding.axes) {
-    throw new ContractError("the decoy generator is not that of the contract");
+    throw unusable("the decoy generator is not that of the contract");
   }
   const { embedder_sha256, preprocessing } = binding;
   const space = await digest({ embedder_sha256, preprocessing });
   if (generator.madeWith !== undefined && generator.madeWith !== space) {
-    throw new ContractError("the decoys are of another model or preprocessing, and hide nothing");
+    throw unusable("the decoys are of another model or preprocessing, and hide nothing");
   }
 }
 
@@ -67,7 +61,7 @@ function probeDimension({ calibrations }: PublicContract, dim: number | undefine
   const known = calibrations.filter(({ mode }) => mode === "s2s").map(({ probe_m }) => probe_m);
   const chosen = dim ?? Math.max(...known);
   if (known.includes(chosen)) return chosen;
-  throw new ContractError(
+  throw unusable(
     known.length === 0
       ? "the contract takes no lifted probes; calibrate it with --probe-dims"
       : `the contract takes lifted probes of dimension ${known.join(", ")}, not ${chosen}`,

@@ -1,7 +1,7 @@
 /** Decoys that belong to nobody, spread like real embeddings: `templates/decoys/generator.py`. */
 
 import { sha256 } from "../bytes.js";
-import { ContractError } from "../errors.js";
+import { unusable } from "../errors.js";
 import { normal } from "./samples.js";
 import { dot, rowsOf } from "./subspace.js";
 
@@ -34,7 +34,7 @@ export class DecoyGenerator {
   /**
    * Read the answer of `GET /v1/contract/generator`; the bytes may be hostile.
    *
-   * @throws ContractError if they are no generator, or one whose decoys would hide nothing.
+   * @throws `unusable_contract` if they are no generator, or one whose decoys would hide nothing.
    */
   static async fromBytes(bytes: Uint8Array): Promise<DecoyGenerator> {
     const { n, k, madeWith, parts } = read(bytes);
@@ -46,11 +46,11 @@ export class DecoyGenerator {
   /** Take an embedding, n values of norm 1, to the k coordinates that templates have, of norm 1. */
   project(embedding: Float32Array): Float64Array {
     if (embedding.length !== this.n) {
-      throw new ContractError(`an embedding has ${this.n} numbers, not ${embedding.length}`);
+      throw unusable(`an embedding has ${this.n} numbers, not ${embedding.length}`);
     }
     const point = Float64Array.from(embedding);
     if (!(Math.abs(Math.sqrt(dot(point, point)) - 1) <= TOLERANCE)) {
-      throw new ContractError("an embedding must have norm 1; L2-normalise it");
+      throw unusable("an embedding must have norm 1; L2-normalise it");
     }
     const along = new Float64Array(this.k);
     rowsOf(this.parts.axes, this.k).forEach((row, i) => {
@@ -74,7 +74,7 @@ export class DecoyGenerator {
 
 function direction(vector: Float64Array, otherwise: string): Float64Array {
   const norm = Math.sqrt(dot(vector, vector));
-  if (!(norm > SMALLEST_NORM) || !Number.isFinite(norm)) throw new ContractError(otherwise);
+  if (!(norm > SMALLEST_NORM) || !Number.isFinite(norm)) throw unusable(otherwise);
   return vector.map((value) => value / norm);
 }
 
@@ -85,17 +85,17 @@ function direction(vector: Float64Array, otherwise: string): Float64Array {
 function requireSpread({ axes, mean, root }: Parts, k: number): void {
   const within = (values: Float64Array): boolean => values.every((value) => Math.abs(value) <= LARGEST);
   if (![axes, mean, root].every(within)) {
-    throw new ContractError("the decoy generator holds values that are out of range");
+    throw unusable("the decoy generator holds values that are out of range");
   }
   const lines = rowsOf(root, k);
   if (!lines.every((line, i) => line[i] > 0 && line.subarray(i + 1).every((value) => value === 0))) {
-    throw new ContractError("the root of the decoy generator is no lower Cholesky factor");
+    throw unusable("the root of the decoy generator is no lower Cholesky factor");
   }
   // The sum of the deviations along principal axes is at least the trace of any root.
   const trace = lines.reduce((sum, line, i) => sum + line[i], 0);
   const spread = trace ** 2 / dot(root, root);
   if (k >= CHECKED_FROM && spread < SMALLEST_SHARE * k) {
-    throw new ContractError(
+    throw unusable(
       `the decoys would spread over ${spread.toFixed(0)} of ${k} axes, and would hide nothing`,
     );
   }
@@ -109,44 +109,33 @@ function requireOrthonormal(axes: Float64Array, k: number): void {
       for (let j = 0; j <= i; j++) line[j] += factor * row[j];
     }
   }
-  const orthonormal = products.every((line, i) =>
-    line.every((value, j) => Math.abs(value - (i === j ? 1 : 0)) <= TOLERANCE),
-  );
-  if (!orthonormal) throw new ContractError("the axes of the decoy generator are not orthonormal");
+  const isOne = (line: Float64Array, i: number): boolean =>
+    line.every((value, j) => Math.abs(value - (i === j ? 1 : 0)) <= TOLERANCE);
+  if (!products.every(isOne)) throw unusable("the axes of the decoy generator are not orthonormal");
 }
 
 /** Read the safetensors of a generator (docs/formats.md): three float32 arrays, and nothing else. */
 function read(bytes: Uint8Array): { n: number; k: number; madeWith: string | undefined; parts: Parts } {
-  const broken = new ContractError("this is not a decoy generator of version 2");
+  const broken = unusable("this is not a decoy generator of version 2");
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
   const size = bytes.length < 8 ? Infinity : Number(view.getBigUint64(0, true));
   if (size > MAX_HEADER) throw broken;
   let header: Record<string, unknown>;
   let fields: Record<string, unknown>;
-  let n: number;
-  let k: number;
+  let [n, k] = [0, 0];
   try {
-    const { __metadata__: metadata, ...arrays } = JSON.parse(
-      new TextDecoder().decode(bytes.subarray(8, 8 + size)),
-    );
+    const text = new TextDecoder().decode(bytes.subarray(8, 8 + size));
+    const { __metadata__: metadata, ...arrays } = JSON.parse(text);
     [header, fields, [n, k]] = [arrays, JSON.parse(metadata.veilface), arrays.axes.shape];
   } catch {
     // The parser's own words may quote the input.
     throw broken;
   }
   const { format, version, made_with: madeWith, ...others } = fields;
-  const isUpTo = (value: number, most: number): boolean =>
-    Number.isInteger(value) && value >= 2 && value <= most;
-  if (
-    format !== "veilface decoy generator" ||
-    version !== 2 ||
-    !(madeWith === undefined || (typeof madeWith === "string" && /^[0-9a-f]{64}$/.test(madeWith))) ||
-    Object.keys(others).length > 0 ||
-    !isUpTo(n, MAX_DIMENSION) ||
-    !isUpTo(k, n)
-  ) {
-    throw broken;
-  }
+  const isUpTo = (value: number, most: number): boolean => Number.isInteger(value) && value >= 2 && value <= most;
+  const isHash = typeof madeWith === "string" && /^[0-9a-f]{64}$/.test(madeWith);
+  if (format !== "veilface decoy generator" || version !== 2 || Object.keys(others).length > 0) throw broken;
+  if (!(isHash || madeWith === undefined) || !isUpTo(n, MAX_DIMENSION) || !isUpTo(k, n)) throw broken;
   const shapes = { axes: [n, k], mean: [k], root: [k, k] };
   const expected: Record<string, object> = {};
   let end = 0;
@@ -166,5 +155,5 @@ function read(bytes: Uint8Array): { n: number; k: number; madeWith: string | und
     mean: numbers.subarray(mean, root),
     root: numbers.subarray(root),
   };
-  return { n, k, madeWith, parts };
+  return { n, k, madeWith: isHash ? madeWith : undefined, parts };
 }

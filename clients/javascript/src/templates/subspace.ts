@@ -1,7 +1,7 @@
 /** The private template: an affine subspace in a form that shows nothing but the set, and its bytes. */
 
 import { concealed } from "../bytes.js";
-import { ContractError } from "../errors.js";
+import { unusable } from "../errors.js";
 import { normal } from "./samples.js";
 
 /** One private template, foot + span(basis). Printing it shows no number of it. */
@@ -29,15 +29,13 @@ const add = (to: Float64Array, factor: number, row: Float64Array): void => {
 
 /** Rows of a matrix, as views. */
 export const rowsOf = (values: Float64Array, columns: number): Float64Array[] =>
-  Array.from({ length: values.length / columns }, (_, i) =>
-    values.subarray(i * columns, (i + 1) * columns),
-  );
+  Array.from({ length: values.length / columns }, (_, i) => values.subarray(i * columns, (i + 1) * columns));
 
 /**
  * Orthonormalise rows in order by the Gram–Schmidt process; every row keeps its direction's sign.
  *
  * Each row is projected twice, which is as accurate as Householder's method (Giraud et al. 2005).
- * Throws `ContractError` where a row lies in the span of those before it, or is zero.
+ * Throws `unusable_contract` where a row lies in the span of those before it, or is zero.
  */
 export function orthonormalised(rows: readonly Float64Array[]): Float64Array[] {
   const done: Float64Array[] = [];
@@ -46,7 +44,7 @@ export function orthonormalised(rows: readonly Float64Array[]): Float64Array[] {
     const scaled = (least: number): void => {
       const length = Math.sqrt(dot(next, next));
       if (!(length > least)) {
-        throw new ContractError("the directions of a subspace are linearly dependent: draw others");
+        throw unusable("the directions of a subspace are linearly dependent: draw others");
       }
       next.forEach((value, i) => (next[i] = value / length));
     };
@@ -68,10 +66,7 @@ export function orthonormalised(rows: readonly Float64Array[]): Float64Array[] {
  * the samples alone, not on the embedding, nor on the decoys one by one (docs/method.md §2.2).
  * All of it is float64; the result is rounded to float32.
  */
-export function templateThrough(
-  point: Float64Array,
-  directions: readonly Float64Array[],
-): AffineSubspace {
+export function templateThrough(point: Float64Array, directions: readonly Float64Array[]): AffineSubspace {
   const [m, k] = [directions.length, point.length];
   const frame = rowsOf(normal(m * k), k);
   const span = orthonormalised(directions);

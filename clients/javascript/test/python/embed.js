@@ -4,7 +4,7 @@ import { readFile } from "node:fs/promises";
 
 import * as ort from "onnxruntime-web";
 
-import { ModelPack, PhotoError, rgbImage } from "../../dist/index.js";
+import { ModelPack, rgbImage, VeilfaceError } from "../../dist/index.js";
 import { bytes, input, output, text } from "./io.js";
 
 ort.env.wasm.numThreads = 1;
@@ -24,7 +24,7 @@ async function sample({ data, width, height }) {
     const milliseconds = performance.now() - begun;
     return { face, crop: text(crop.data), quality, embedding: text(embedding), milliseconds };
   } catch (error) {
-    if (!(error instanceof PhotoError)) throw error;
+    if (!(error instanceof VeilfaceError)) throw error;
     return { code: error.code, message: error.message, details: error.details };
   }
 }

@@ -1,6 +1,6 @@
 /** Draw and lift for tests/clients/javascript/test_lifting.py. */
 
-import { ContractError, DecoyGenerator, lift, liftTemplate, meanEmbedding, PhotoError, requireContract } from "../../dist/index.js";
+import { DecoyGenerator, lift, liftTemplate, meanEmbedding, requireContract, VeilfaceError } from "../../dist/index.js";
 import { normal, uniform } from "../../dist/templates/samples.js";
 import { encode } from "../../dist/templates/subspace.js";
 import { bytes, input, output, text } from "./io.js";
@@ -50,7 +50,7 @@ async function answer({ call, ...given }) {
   try {
     return { value: await calls[call](given) };
   } catch (error) {
-    if (!(error instanceof ContractError || error instanceof PhotoError)) throw error;
+    if (!(error instanceof VeilfaceError)) throw error;
     const { code, message, details } = error;
     return { code, message, details };
   }

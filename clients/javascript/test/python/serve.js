@@ -10,7 +10,7 @@ import { bytes, input, output } from "./io.js";
 
 ort.env.wasm.numThreads = 1;
 
-const { url, bearer, embedder, steps, retries } = await input();
+const { url, bearer, embedder, steps } = await input();
 /** Values that later steps name by `{"kept": name}`. */
 const kept = { holderKey: newHolderKey() };
 
@@ -41,8 +41,8 @@ function client(kind, as) {
     clients.set(
       key,
       kind === "photos"
-        ? new Client(url, as, { retries, fetch: losing })
-        : new PrivateClient(url, as, { retries, fetch: losing, runtime, ...(graphs && { graphs }) }),
+        ? new Client(url, as, { fetch: losing })
+        : new PrivateClient(url, as, { fetch: losing, runtime, ...(graphs && { graphs }) }),
     );
   }
   return clients.get(key);
@@ -59,8 +59,8 @@ for (const { kind = "private", as = bearer, call, args = [], keep, lost = 0 } of
   } catch (error) {
     if (!(error instanceof VeilfaceError)) throw error;
     kept.lift = error.lift;
-    const { name, code, status, details, sent, message } = error;
-    outcomes.push({ error: name, code, status, details, sent, message, lift: inspect(error.lift) });
+    const { code, status, details, sent, message } = error;
+    outcomes.push({ code, status, details, sent, message, lift: inspect(error.lift) });
   }
 }
 output(outcomes);
