@@ -1,8 +1,8 @@
 // The camera, with live guidance: about one small frame a second is asked about, and slower where the service
 // says so. The photos that count are taken at full size, a burst of three.
 
-import { faceBox, h, s } from "./dom.js";
-import { Problem, call, crops, form, session } from "./service.js";
+import { h } from "./dom.js";
+import { Problem, call, form } from "./service.js";
 import { cameraTrouble, guidance, sentence } from "./words.js";
 
 const EVERY_MS = 1000;
@@ -13,27 +13,19 @@ export const BURST = 3;
 // Apart enough for another moment of the face, and over before anyone moves.
 const APART_MS = 300;
 
-// A picture of at most `side` pixels as JPEG, its middle square where that is asked for.
-export async function picture(source, width, height, { side, quality = QUALITY, square = false }) {
-  const [w, hgt] = square ? [Math.min(width, height), Math.min(width, height)] : [width, height];
-  const scale = Math.min(1, side / Math.max(w, hgt));
-  const canvas = h("canvas", { width: Math.round(w * scale), height: Math.round(hgt * scale) });
-  canvas
-    .getContext("2d")
-    .drawImage(source, (width - w) / 2, (height - hgt) / 2, w, hgt, 0, 0, canvas.width, canvas.height);
+// A picture of at most `side` pixels as JPEG.
+export async function picture(source, width, height, { side, quality = QUALITY }) {
+  const scale = Math.min(1, side / Math.max(width, height));
+  const canvas = h("canvas", { width: Math.round(width * scale), height: Math.round(height * scale) });
+  canvas.getContext("2d").drawImage(source, 0, 0, canvas.width, canvas.height);
   const blob = await new Promise((done) => canvas.toBlob(done, "image/jpeg", quality));
   // No blob: the picture is empty, or too large for the browser.
   if (!blob) throw new Problem({ code: "page_error", message: "the browser could not take a photo" });
-  return { blob, width: canvas.width, height: canvas.height };
+  return blob;
 }
 
 export const check = (blob, face, signal) =>
-  session.mode?.active()
-    ? session.mode.check(blob, face, signal)
-    : call("POST", "/v1/photos/check", { body: form("image", [blob], { face }), signal });
-
-// The service could not be asked; that says nothing of the photo.
-export const unasked = ({ status, code }) => code !== "page_error" && (!status || status === 429 || status >= 500);
+  call("POST", "/v1/photos/check", { body: form("image", [blob], { face }), signal });
 
 export const after = (ms) => new Promise((done) => setTimeout(done, ms));
 
@@ -43,9 +35,7 @@ const release = (stream) => stream?.getTracks().forEach((track) => track.stop())
 export function viewfinder(...overlays) {
   const video = h("video", { playsinline: true, muted: true, hidden: true, "aria-label": "Your camera" });
   video.muted = true;
-  const outline = s("ellipse", { class: "outline", cx: "50", cy: "50", rx: "21", ry: "38" });
-  const shape = { class: "overlay", viewBox: "0 0 100 100", preserveAspectRatio: "none", "aria-hidden": "true" };
-  const root = h("div", { class: "viewfinder" }, video, s("svg", shape, outline), overlays);
+  const root = h("div", { class: "viewfinder" }, video, overlays);
   return {
     root,
     // Runs until `signal` ends. `lost` is called where it is unplugged, forbidden, or taken by another program.
@@ -85,8 +75,7 @@ export function viewfinder(...overlays) {
 // `burst()` resolves to photos, as {blob, name}. `face()` says which face counts; `onchange` is called where the camera
 // goes on or off.
 export function camera({ face, onchange }) {
-  const { overlay, mark } = faceBox();
-  const finder = viewfinder(overlay);
+  const finder = viewfinder();
   const guide = h("p", { class: "guidance", role: "status", "data-state": "idle" }, "The camera is off.");
   let running = new AbortController();
   running.abort();
@@ -120,29 +109,18 @@ export function camera({ face, onchange }) {
       // Photos go first.
       if (!document.hidden && finder.isOn() && !taking && !guide.closest("fieldset:disabled")) {
         try {
-          const small = await snap(FRAME, 0.8);
-          const seen = await check(small.blob, face(), signal);
+          const seen = await check(await finder.shot({ side: FRAME, quality: 0.8 }), face(), signal);
           if (signal.aborted) return;
           say(guidance(seen), seen.usable ? "good" : "bad");
-          mark(seen.box, small.width, small.height);
         } catch (error) {
           if (signal.aborted) return;
-          mark(null);
-          pause = 1000 * Math.max(2, (error instanceof Problem && error.wait) || 0);
-          say(
-            error.code === "rate_limited"
-              ? "Guidance is paused: too many requests. You can still take a photo."
-              : "Guidance is unavailable right now. You can still take a photo.",
-            "idle",
-          );
+          pause = 1000 * Math.max(2, (error instanceof Problem && error.retryAfter) || 0);
+          say("Guidance is paused. You can still take a photo.", "idle");
         }
       }
       await after(Math.max(250, pause - (Date.now() - begun)));
     }
   }
-
-  // Packs without a detector take aligned crops, which are square.
-  const snap = (side, quality) => finder.shot({ side, quality, square: crops() });
 
   async function burst() {
     const { signal } = running;
@@ -153,7 +131,7 @@ export function camera({ face, onchange }) {
       for (let shot = 0; shot < BURST; shot++) {
         if (shot) await after(APART_MS);
         signal.throwIfAborted();
-        photos.push({ blob: (await snap(PHOTO, QUALITY)).blob, name: "camera" });
+        photos.push({ blob: await finder.shot({ side: PHOTO }), name: "camera" });
       }
       say("Looking for a face…", "idle");
       return photos;

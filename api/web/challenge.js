@@ -58,7 +58,7 @@ export function headMovements() {
   async function snap(signal, wait = 0) {
     await after(wait);
     signal.throwIfAborted();
-    return (await finder.shot({ side: SIDE })).blob;
+    return finder.shot({ side: SIDE });
   }
 
   const root = h(

@@ -1,8 +1,7 @@
 // Elements from code: no text is ever parsed as markup.
 
-const SVG = "http://www.w3.org/2000/svg";
-
-function fill(node, attributes, children) {
+export function h(tag, attributes, ...children) {
+  const node = document.createElement(tag);
   for (const [name, value] of Object.entries(attributes)) {
     if (value === null || value === undefined || value === false) continue;
     if (name.startsWith("on")) node.addEventListener(name.slice(2), value);
@@ -12,10 +11,6 @@ function fill(node, attributes, children) {
   node.append(...children.flat(Infinity).filter((child) => child !== null && child !== undefined));
   return node;
 }
-
-export const h = (tag, attributes, ...children) => fill(document.createElement(tag), attributes, children);
-
-export const s = (tag, attributes, ...children) => fill(document.createElementNS(SVG, tag), attributes, children);
 
 // A command, not broken within an option.
 export const command = (text) =>
@@ -51,22 +46,6 @@ export function choice(legend, choices, { value, onchange }) {
   return { root, value: () => radios.find((radio) => radio.checked).value };
 }
 
-// A box around a face, over a picture that fills its frame.
-export function faceBox() {
-  const box = s("rect", { class: "found", hidden: true });
-  const overlay = s("svg", { class: "overlay", preserveAspectRatio: "xMidYMid slice", "aria-hidden": "true" }, box);
-  // `corners` are x1, y1, x2, y2 in pixels of a picture of this size, or null.
-  const mark = (corners, width, height) => {
-    box.toggleAttribute("hidden", !corners);
-    if (!corners) return;
-    overlay.setAttribute("viewBox", `0 0 ${width} ${height}`);
-    const [x, y, right, bottom] = corners;
-    const places = { x, y, width: right - x, height: bottom - y, rx: width / 40 };
-    for (const [name, value] of Object.entries(places)) box.setAttribute(name, value);
-  };
-  return { overlay, mark };
-}
-
 // Terms and values; a value that is null is left out.
 export function facts(pairs) {
   return h(
@@ -87,20 +66,19 @@ export const folded = (summary, ...content) =>
 export async function confirmed(title, text, verb, signal) {
   if (signal.aborted) return false;
   const id = newId("dialog");
-  const answer = (value) => () => dialog.close(value);
   const dialog = h(
     "dialog",
     { "aria-labelledby": `${id}-title`, "aria-describedby": `${id}-text` },
     h("h2", { id: `${id}-title` }, title),
     h("p", { id: `${id}-text` }, text),
     h(
-      "p",
-      { class: "row" },
-      h("button", { type: "button", class: "secondary", onclick: answer("keep") }, "Keep"),
-      h("button", { type: "button", class: "danger", onclick: answer("agreed") }, verb),
+      "form",
+      { method: "dialog", class: "row" },
+      h("button", { class: "secondary", value: "keep" }, "Keep"),
+      h("button", { class: "danger", value: "agreed" }, verb),
     ),
   );
-  signal.addEventListener("abort", answer("ended"));
+  signal.addEventListener("abort", () => dialog.close());
   document.body.append(dialog);
   dialog.showModal();
   return new Promise((resolve) => {
@@ -130,6 +108,3 @@ export function download(name, text) {
   h("a", { href: url, download: name }).click();
   setTimeout(() => URL.revokeObjectURL(url), 10000);
 }
-
-// Whether a drag carries files.
-export const carriesFiles = (event) => event.dataTransfer?.types.includes("Files") ?? false;

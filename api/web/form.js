@@ -3,16 +3,16 @@
 import { folded, h } from "./dom.js";
 import { holderKey } from "./holder.js";
 import { photoPicker } from "./photos.js";
-import { session } from "./service.js";
+import { Problem, call, session } from "./service.js";
 import { offNote, subjectField, switchOf, whyOff } from "./subject.js";
 import { problemBox } from "./words.js";
 
 // What differs between the views: `action`, `title` and `lead`; `most` photos, and whether new ones replace them and the
 // camera's are sent at once (`replaces`); `beside` the id; `level()`; `movements`, and whether they are asked for
-// (`moving()`); `verb` on the button; `progress(count)`, words below it; `empty`, shown until there is an outcome.
-// `send(name, given, tools)` resolves to an answer, or to null where the visitor gave up; `show(name, answer, tools)` makes
-// the outcome of it, which is about this person and these photos, and with `always` is shown whatever else was chosen
-// meanwhile; `remedies(error, name, tools)` go with a problem.
+// (`moving()`); `verb` on the button; `progress(count)`, words below it; `empty(lifts)`, shown until there is an outcome.
+// `send(name, given, say)` resolves to an answer, or to null where the visitor gave up; `token(name)` says what else a token
+// for private mode is asked for with; `show(name, answer)` makes the outcome, which is about this person and these
+// photos, and with `always` is shown whatever else was chosen meanwhile.
 export function photoForm(id, view) {
   const { action, replaces = false } = view;
   const why = whyOff(action);
@@ -24,9 +24,7 @@ export function photoForm(id, view) {
   const progress = h("div", { class: "progress", role: "status" });
   const empty = h("div", { class: "empty" });
   const send = h("button", { type: "submit", class: "primary", disabled: true });
-  // A button's text is not read out when it changes.
-  const heard = h("p", { class: "unseen", role: "status" });
-  const say = (text) => (send.textContent = heard.textContent = text);
+  const say = (text) => (send.textContent = progress.textContent = text);
   const moving = () => on && (view.moving?.() ?? false);
   // Counts what was asked: an answer to what is no longer on the page is not shown.
   let asked = 0;
@@ -36,41 +34,37 @@ export function photoForm(id, view) {
     problem.replaceChildren();
   };
   const changed = () => {
+    clear();
     rest();
-    if (!shooting) clear();
   };
-  let shooting = false;
-  const picker = on ? photoPicker({ most: view.most, replaces, shutter: !replaces, onchange: changed, onsource: () => rest() }) : null;
-  const mode = on ? session.mode?.offer(action, refresh) : null;
+  const picker = on ? photoPicker({ most: view.most, sends: replaces ? view.verb : null, onchange: changed }) : null;
+  const mode = on ? session.mode?.privateMode(action, { authorize, onchange: refresh, onresult, onerror }) : null;
+  const lifts = () => mode?.active() ?? false;
   const holder = holderKey(action, clear);
-  // The camera whose photos are sent as soon as they are taken.
-  const shutter = () => (replaces && !moving() ? (picker?.live() ?? null) : null);
 
   // The level was changed, or private mode switched.
   function refresh() {
     clear();
-    mode?.at(view.level?.(), picker);
+    mode?.at(view.level?.());
     if (view.movements) view.movements.root.hidden = !moving();
     if (picker) {
-      picker.root.hidden = moving();
-      if (moving()) picker.start();
+      picker.root.hidden = moving() || lifts();
+      if (picker.root.hidden) picker.start();
     }
     rest();
   }
 
   // What the button does next, and what becomes of the photos.
   function rest() {
-    empty.replaceChildren(view.empty());
+    empty.replaceChildren(view.empty(lifts()));
+    mode?.login.setAttribute("face", picker.face() || "dominant");
     // Until the attempt is over, the button tells how far it is.
     if (on && fields.disabled) return;
-    const camera = shutter();
-    const starts = camera !== null && !camera.isOn();
-    send.textContent = starts ? "Start camera" : moving() ? "Start head movements" : view.verb;
-    heard.textContent = "";
-    send.disabled = !(camera || moving() || picker?.ready());
-    send.formNoValidate = starts;
-    if (!picker || !view.progress) return;
-    const words = view.progress(picker.chosen().length);
+    send.textContent = moving() ? "Start head movements" : view.verb;
+    send.disabled = !(moving() || picker?.ready());
+    send.hidden = !moving() && (picker?.hasShutter() ?? false);
+    act.hidden = lifts();
+    const words = picker ? (view.progress?.(picker.chosen().length) ?? "") : "";
     // Only what changed is read out.
     if (words !== progress.textContent) progress.textContent = words;
   }
@@ -78,61 +72,73 @@ export function photoForm(id, view) {
   async function submit(event) {
     event.preventDefault();
     if (fields.disabled) return;
+    const pressed = document.activeElement;
     clear();
-    const camera = shutter();
-    fields.disabled = shooting = true;
-    let goes = true;
-    if (camera?.isOn()) {
-      say("Hold still…");
-      const burst = await camera.burst();
-      goes = burst.length > 0 && root.isConnected;
-      if (goes) picker.take(burst);
-    } else if (camera) {
-      say("Starting…");
-      await camera.begin();
-      goes = false;
-    }
-    shooting = false;
-    if (goes) await attempt();
+    fields.disabled = true;
+    await attempt();
     fields.disabled = false;
     rest();
     // A button that is switched off loses the focus.
-    if (document.activeElement === document.body) send.focus();
+    if (document.activeElement === document.body) pressed.focus();
   }
 
   async function attempt() {
     const asking = asked;
     const name = subject.id();
     const sent = picker.chosen();
-    const lifts = session.mode?.active() ? session.mode : null;
-    const tools = { lifts, say, drop: () => picker.drop(sent), problem, send };
     let given = { photos: picker.blobs(), face: picker.face() };
-    let answer = null;
-    let failure = null;
     try {
       await subject.searched();
       const holder_key = await holder.key(name, say);
       if (moving()) given = await view.movements.frames(name);
-      answer = await view.send(name, { ...given, holder_key }, tools);
+      const answer = await view.send(name, { ...given, holder_key }, say);
+      fields.disabled = false;
+      if (!answer || !(view.always || asking === asked)) return;
+      if (!replaces) picker.drop(sent);
+      succeed(name, answer);
     } catch (error) {
-      failure = error;
-    }
-    fields.disabled = false;
-    if (!view.always && asking !== asked) return;
-    if (failure) {
-      if (failure.details && !moving()) picker.blame(failure, sent);
-      problem.replaceChildren(problemBox(failure), ...view.remedies(failure, name, tools));
-      problem.scrollIntoView({ block: "nearest" });
-    } else if (answer) {
-      const outcome = view.show(name, answer, tools);
-      // The field says who is enrolled by now.
-      if (action === "enroll") subject.input.dispatchEvent(new Event("input"));
-      result.replaceChildren(outcome);
-      if (outcome.hasAttribute("tabindex")) outcome.focus();
-      result.scrollIntoView({ block: "nearest" });
+      fields.disabled = false;
+      if (view.always || asking === asked) fail(error);
     }
   }
 
+  function succeed(name, answer) {
+    const outcome = view.show(name, answer);
+    // The field says who is enrolled by now.
+    if (action === "enroll") subject.input.dispatchEvent(new Event("input"));
+    result.replaceChildren(outcome);
+    if (outcome.hasAttribute("tabindex")) outcome.focus();
+    result.scrollIntoView({ block: "nearest" });
+  }
+
+  function fail(error) {
+    problem.replaceChildren(problemBox(error));
+    problem.scrollIntoView({ block: "nearest" });
+  }
+
+  // Whom the element of private mode was given a token for last.
+  let authorized = "";
+
+  async function authorize() {
+    if (!subject.input.reportValidity()) throw new Problem({ code: "validation_failed", message: "type the person’s id first" });
+    clear();
+    authorized = subject.id();
+    await subject.searched();
+    mode.login.toggleAttribute("passkey", holder.wanted());
+    const json = { subject_id: authorized, action, ...(await view.token(authorized)) };
+    return { subject: authorized, token: (await call("POST", "/v1/tokens", { json })).token };
+  }
+
+  function onresult(answer) {
+    succeed(authorized, answer);
+  }
+
+  function onerror(error) {
+    // About photos, and where the visitor gave up, the element has said it.
+    if (error.name !== "AbortError" && !session.client.isPhotoRefused(error)) fail(error);
+  }
+
+  const act = h("div", { class: "act-part" }, progress, send);
   const fields = h(
     "fieldset",
     { class: "plain", disabled: !on },
@@ -143,8 +149,8 @@ export function photoForm(id, view) {
       view.beside,
       on ? folded(action === "verify" ? "Options" : "Options: lock to a passkey, largest face", holder.parts, picker.option) : null,
     ),
-    h("div", { class: "card photo-part" }, picker?.root, on ? view.movements?.root : null, switchOf(mode)),
-    h("div", { class: "act-part" }, progress, send, heard),
+    h("div", { class: "card photo-part" }, picker?.root, on ? view.movements?.root : null, mode?.login, switchOf(mode)),
+    act,
   );
   const outcome = h("div", { class: "outcome" }, problem, result, empty);
   const form = h("form", { class: "work", onsubmit: submit }, fields, outcome);
@@ -157,7 +163,6 @@ export function photoForm(id, view) {
     form,
   );
   if (replaces) subject.input.addEventListener("input", clear);
-  picker?.dropOn(form);
   picker?.start();
   refresh();
   return {

@@ -53,5 +53,5 @@ export function holderKey(action, onchange) {
   }
 
   const check = h("p", { class: "check" }, box, h("label", { for: box.id }, label));
-  return { parts: [check, note], showLock, key, stop: () => ended.abort() };
+  return { parts: [check, note], wanted: () => box.checked, showLock, key, stop: () => ended.abort() };
 }

@@ -1,6 +1,6 @@
 // Sign-in, navigation and focus; each view is a module of its own.
 
-import { carriesFiles, command, field, h } from "./dom.js";
+import { command, field, h } from "./dom.js";
 import { enrollView } from "./enroll.js";
 import { peopleView } from "./people.js";
 import { serviceView } from "./status.js";
@@ -14,12 +14,6 @@ const VIEWS = {
   people: ["People", peopleView],
   service: ["Service", serviceView],
 };
-const PROMISES = [
-  ["Only a set with decoys is kept.", "The face is one point of it among many. Photos and embeddings are forgotten; the set is encrypted."],
-  ["Every decision states its error.", "You choose how often a stranger may be accepted: 1 in 100, 1 in 1,000."],
-  ["Erasure leaves a proof.", "The template and its key are gone, and you hold a signed receipt."],
-];
-
 const main = document.getElementById("main");
 const nav = document.getElementById("nav");
 const who = document.getElementById("who");
@@ -117,13 +111,9 @@ function signInView(problem = null) {
     { class: "sign-in" },
     h(
       "div",
-      { class: "claim" },
+      {},
       h("p", { class: "claim-line" }, "Face login that never stores a face."),
-      h(
-        "dl",
-        { class: "promises" },
-        PROMISES.map(([what, how]) => h("div", {}, h("dt", {}, what), h("dd", {}, how))),
-      ),
+      h("p", {}, "Only a set with decoys is kept, encrypted: the face is one point of it among many. Photos and embeddings are forgotten."),
     ),
     h(
       "div",
@@ -162,9 +152,11 @@ document.querySelector(".skip").addEventListener("click", (event) => {
   main.focus();
 });
 addEventListener("hashchange", () => route());
-// Files that miss a form that takes photos must not replace the page.
+// Files that miss the field for photos must not replace the page.
 for (const type of ["dragover", "drop"]) {
-  addEventListener(type, (event) => carriesFiles(event) && event.preventDefault());
+  addEventListener(type, (event) => {
+    if (event.target.type !== "file" && event.dataTransfer.types.includes("Files")) event.preventDefault();
+  });
 }
 
 if (hasKey()) await resume();

@@ -1,7 +1,7 @@
 // Where photos come from (camera, files, in the demo cartoon people), and a tray of those chosen.
 
-import { BURST, camera, check, picture, unasked } from "./camera.js";
-import { carriesFiles, choice, faceBox, h, newId } from "./dom.js";
+import { BURST, camera, check, picture } from "./camera.js";
+import { choice, field, h, newId } from "./dom.js";
 import { BASE, Problem, call } from "./service.js";
 import { DEMO, guidance, problemBox, sentence } from "./words.js";
 
@@ -16,7 +16,7 @@ async function smaller(blob) {
   try {
     bitmap = await createImageBitmap(blob);
     if (Math.max(bitmap.width, bitmap.height) <= SIDE && blob.size <= BYTES) return blob;
-    return (await picture(bitmap, bitmap.width, bitmap.height, { side: SIDE })).blob;
+    return await picture(bitmap, bitmap.width, bitmap.height, { side: SIDE });
   } catch {
     return blob;
   } finally {
@@ -24,15 +24,14 @@ async function smaller(blob) {
   }
 }
 
-// `most` photos; with `replaces`, what is chosen takes the place of what was chosen before. With `shutter` the camera has
-// a button of its own; else `live()` is the camera, where that is the source. `onchange` is called where the chosen photos
-// change, `onsource` where the camera goes on or off or other photos are offered.
-export function photoPicker({ most, replaces = false, shutter = false, onchange, onsource }) {
+// `most` photos. With `sends`, what is chosen takes the place of what was chosen before, and the camera's photos are sent at
+// once by its button, which says `sends`. `onchange` is called where the chosen photos or their source change.
+export function photoPicker({ most, sends = null, onchange }) {
   const photos = [];
   const tray = h("ul", { class: "tray", "aria-label": "Chosen photos" });
   const status = h("p", { class: "hint", role: "status" });
   const panel = h("div", { class: "source" });
-  const largest = h("input", { type: "checkbox", id: newId("largest"), onchange: () => photos.forEach(look) });
+  const largest = h("input", { type: "checkbox", id: newId("largest"), onchange: () => (photos.forEach(look), onchange()) });
   const face = () => (largest.checked ? "largest" : "");
   const ended = new AbortController();
   let live = null;
@@ -44,11 +43,11 @@ export function photoPicker({ most, replaces = false, shutter = false, onchange,
   function take(together) {
     // The view was left while they were on their way.
     if (ended.signal.aborted) return;
-    if (replaces) [...photos].forEach(remove);
+    if (sends) [...photos].forEach(remove);
     const room = most - photos.length;
     together.slice(0, room).forEach(add);
     if (together.length > room) {
-      status.textContent = `No more than ${most} photos: ${replaces ? "these are the first" : "remove one first"}.`;
+      status.textContent = `No more than ${most} photos: ${sends ? "these are the first" : "remove one first"}.`;
     }
   }
 
@@ -63,8 +62,8 @@ export function photoPicker({ most, replaces = false, shutter = false, onchange,
   function add({ blob, name }) {
     // What the camera took has its size already.
     const ready = name === "camera" ? blob : null;
-    const photo = { blob: ready, name, ...faceBox(), image: h("img", { alt: `Chosen photo, from ${name}` }) };
-    photo.thumb = h("span", { class: "thumb" }, photo.image, photo.overlay);
+    const photo = { blob: ready, name, image: h("img", { alt: `Chosen photo, from ${name}` }) };
+    photo.thumb = h("span", { class: "thumb" }, photo.image);
     photo.number = h("span", { class: "number" });
     photo.verdict = h("span", { class: "seen", "data-state": "idle" }, "Checking…");
     const drop = () => {
@@ -116,13 +115,10 @@ export function photoPicker({ most, replaces = false, shutter = false, onchange,
       try {
         const seen = await check(photo.blob, face(), ended.signal);
         say(photo, seen.usable ? "Good" : guidance(seen), seen.usable ? "good" : "bad");
-        await photo.image.decode().catch(() => {});
-        photo.mark(seen.box, photo.image.naturalWidth, photo.image.naturalHeight);
       } catch (error) {
         if (error.name === "AbortError") return;
         if (!(error instanceof Problem)) throw error;
-        if (unasked(error)) say(photo, "Not checked yet.", "idle");
-        else say(photo, sentence(error.message), "bad");
+        say(photo, sentence(error.message), error.status === 400 ? "bad" : "idle");
       }
     });
   }
@@ -134,29 +130,21 @@ export function photoPicker({ most, replaces = false, shutter = false, onchange,
 
   const sources = {
     camera() {
-      const verb = () => (live?.isOn() ? `Take ${BURST} photos` : "Start camera");
-      const button = h("button", { type: "button", class: "secondary", onclick: press }, verb());
-      live = camera({
-        face,
-        onchange: () => {
-          button.textContent = verb();
-          onsource();
-        },
-      });
+      const verb = () => (live?.isOn() ? sends ?? `Take ${BURST} photos` : "Start camera");
+      const button = h("button", { type: "button", class: sends ? "primary" : "secondary", onclick: press }, verb());
+      live = camera({ face, onchange: () => (button.textContent = verb()) });
       async function press() {
-        button.disabled = true;
-        if (live.isOn()) take(await live.burst());
-        else await live.begin();
-        button.disabled = false;
-        // A button that is switched off loses the focus.
-        if (document.activeElement === document.body) button.focus();
+        if (!live.isOn()) return live.begin();
+        if (sends && !button.form.reportValidity()) return;
+        const burst = await live.burst();
+        take(burst);
+        if (sends && burst.length) button.form.requestSubmit();
       }
-      return [live.root, shutter ? h("p", { class: "row" }, button) : ""];
+      return [live.root, h("p", { class: "row" }, button)];
     },
     files() {
       const input = h("input", {
         type: "file",
-        class: "unseen",
         id: newId("files"),
         accept: "image/jpeg,image/png,image/webp",
         multiple: true,
@@ -166,47 +154,46 @@ export function photoPicker({ most, replaces = false, shutter = false, onchange,
         },
       });
       const hint = h("span", { class: "hint" }, `JPEG, PNG or WebP, up to ${most}`);
-      return [input, h("label", { class: "drop", for: input.id }, h("strong", {}, "Choose photos, or drop them here"), hint)];
+      const label = h("label", { for: input.id }, h("strong", {}, "Choose photos, or drop them here"));
+      // The field covers its words: the browser itself takes what is dropped on it.
+      return [h("div", { class: "drop" }, label, hint, input)];
     },
     drawn() {
       const who = h("select", { id: newId("who"), onchange: show });
       const shots = h("div", { class: "shots" });
       let count = 0;
       function show() {
-        shots.replaceChildren(
-          ...Array.from({ length: count }, (_, index) => {
-            const url = `${BASE}/demo/people/${who.value}/${index}.png`;
-            const name = `${who.value}, photo ${index + 1}`;
-            const choose = async () => {
-              const drawn = await fetch(url);
-              if (drawn.ok) take([{ blob: await drawn.blob(), name }]);
-            };
-            const label = `Choose photo ${index + 1} of ${who.value}`;
-            return h(
-              "button",
-              { type: "button", class: "shot", "aria-label": label, onclick: choose },
-              h("img", { src: url, alt: "", width: "84", height: "84" }),
-            );
-          }),
-        );
+        shots.replaceChildren(...Array.from({ length: count }, (_, index) => shot(who.value, index)));
       }
-      const place = h("div", {});
       call("GET", "/demo/people")
         .then(({ people, shots: each }) => {
           count = each;
           who.append(...people.map((person) => h("option", {}, person)));
           show();
         })
-        .catch((error) => place.replaceChildren(problemBox(error)));
-      return [h("div", { class: "field" }, h("label", { for: who.id }, "Cartoon person"), who), shots, place];
+        .catch((error) => shots.replaceChildren(problemBox(error)));
+      return [field("Cartoon person", who), shots];
     },
   };
+
+  function shot(person, index) {
+    const url = `${BASE}/demo/people/${person}/${index}.png`;
+    const choose = async () => {
+      const drawn = await fetch(url);
+      if (drawn.ok) take([{ blob: await drawn.blob(), name: `${person}, photo ${index + 1}` }]);
+    };
+    return h(
+      "button",
+      { type: "button", class: "shot", "aria-label": `Choose photo ${index + 1} of ${person}`, onclick: choose },
+      h("img", { src: url, alt: "", width: "84", height: "84" }),
+    );
+  }
 
   function choose(source) {
     live?.stop();
     live = null;
     panel.replaceChildren(...sources[source]());
-    onsource();
+    onchange();
   }
 
   const names = { ...(DEMO ? { drawn: "Cartoon people" } : {}), camera: "Camera", files: "Files" };
@@ -226,32 +213,17 @@ export function photoPicker({ most, replaces = false, shutter = false, onchange,
     largest,
     h("label", { for: largest.id }, "Others are in the picture: use the largest face, wherever it is"),
   );
-  const holds = (event) => !root.hidden && !root.closest(":disabled") && carriesFiles(event);
   return {
     root,
     option,
     face,
-    take,
-    live: () => live,
+    hasShutter: () => live !== null && sends !== null,
     start: () => choose(source.value()),
     ready: () => photos.length > 0 && photos.every((photo) => photo.blob),
-    // Let photos be dropped on a form.
-    dropOn: (form) => form.addEventListener("drop", (event) => holds(event) && takeFiles(event.dataTransfer.files)),
     blobs: () => photos.map((photo) => photo.blob),
     chosen: () => [...photos],
-    // What the service said of single photos, by their places among those `sent`.
-    blame(problem, sent) {
-      const { image, photos: unlike } = problem.details;
-      if (sent[image]) say(sent[image], sentence(problem.message.replace(/^photo \d+ of \d+: /, "")), "bad");
-      for (const index of unlike ?? []) {
-        if (sent[index]) say(sent[index], "Does not look like the person in the other photos.", "bad");
-      }
-    },
-    // Empty the tray of what was sent, of which the pictures are handed out.
-    drop(sent) {
-      sent.filter((photo) => photos.includes(photo)).forEach(remove);
-      return sent.map((photo) => photo.thumb);
-    },
+    // Empty the tray of what was sent.
+    drop: (sent) => sent.filter((photo) => photos.includes(photo)).forEach(remove),
     stop: () => {
       live?.stop();
       ended.abort();

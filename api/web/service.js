@@ -34,8 +34,6 @@ export function forgetKey() {
   session.mode?.forget();
 }
 
-export const untilSignedOut = () => running.signal;
-
 // Some browsers are set to block the storage: then the key is not kept, and all else works.
 function kept(use) {
   try {
@@ -51,7 +49,7 @@ export const may = (right) => session.own?.rights.includes(right) ?? false;
 export class Problem extends Error {
   constructor(fields) {
     super(fields.message);
-    Object.assign(this, { details: {}, requestId: null, wait: null, status: 0 }, fields);
+    Object.assign(this, { details: {}, requestId: null, retryAfter: null, status: 0 }, fields);
   }
 }
 
@@ -84,7 +82,7 @@ export async function call(method, path, { json, body, headers, signal } = {}) {
     message: content?.error?.message ?? `status ${answer.status}, and not from this service`,
     details: content?.error?.details ?? {},
     requestId: content?.request_id ?? answer.headers.get("X-Request-ID"),
-    wait: Number(answer.headers.get("Retry-After")) || null,
+    retryAfter: Number(answer.headers.get("Retry-After")) || null,
   });
   // `replayed` is about a challenge; else the key itself was refused, if it is still in use.
   if (problem.code === "unauthorized" && session.own && used === key) session.onrefused(problem);
@@ -115,5 +113,3 @@ export const levels = () =>
 
 // Whether a verification must answer a challenge of head movements.
 export const moves = () => ["active", "both"].includes(session.own?.liveness);
-
-export const crops = () => !session.contract.recorded.detector;

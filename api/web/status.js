@@ -1,4 +1,4 @@
-import { download, facts, folded, h, percent, when } from "./dom.js";
+import { download, facts, h, percent, when } from "./dom.js";
 import { call, session } from "./service.js";
 import { problemBox } from "./words.js";
 
@@ -28,11 +28,7 @@ function privacyCard({ verdict }) {
   const proven = privacy?.status === "PASS";
   const opens = !privacy?.rate.errors
     ? `none of ${privacy?.rate.trials.toLocaleString("en")} people could be recognised elsewhere`
-    : privacy.value > 0.7
-      ? "nearly everybody could be recognised elsewhere"
-      : privacy.value >= 0.25
-        ? `about ${Math.round(10 * privacy.value)} in 10 people could be recognised elsewhere`
-        : `about 1 person in ${Math.round(1 / privacy.value)} could be recognised elsewhere`;
+    : `${percent(privacy.value)} of the people could be recognised elsewhere`;
   return h(
     "section",
     { class: `card privacy ${proven ? "proven" : "unproven"}` },
@@ -75,24 +71,19 @@ function tile(title, judgement) {
 
 // What the service keeps of a person, and by which contract.
 function storedCard(contract) {
-  const { binding, contract_id: id, recorded, default_level: level, receipt_key: receipt } = contract;
+  const { binding, contract_id: id, recorded, default_level: level } = contract;
   const save = () => download("contract.json", JSON.stringify(contract, null, 1));
   return h(
     "section",
     { class: "card" },
     h("h2", {}, "What is stored"),
     h("p", {}, "Of each person an id, dates, and one encrypted template: a set that holds the embedding among decoys. No photo, and no embedding as such. How well the set hides it is the verdict above."),
-    folded(
-      "Geometry and contract",
-      facts([
-        ["Template", `m = ${binding.m} of ${binding.axes} axes, ${binding.strategy}; embeddings have ${binding.n}`],
-        ["Decoys", h("code", {}, binding.decoy_source_id)],
-        ["Contract", h("code", {}, id)],
-        ["Model pack", String(recorded.pack ?? "not recorded")],
-        ["Default level", level],
-        ["Receipt key", h("code", {}, receipt.public_key)],
-      ]),
-    ),
+    facts([
+      ["Template", `m = ${binding.m} of ${binding.axes} axes, ${binding.strategy}; embeddings have ${binding.n}`],
+      ["Model pack", String(recorded.pack ?? "not recorded")],
+      ["Default level", level],
+      ["Contract", h("code", {}, id)],
+    ]),
     h("p", { class: "row" }, h("button", { type: "button", class: "secondary", onclick: save }, "Download contract")),
   );
 }

@@ -1,16 +1,20 @@
-// The field for a person's id. With a key that may list people, the browser suggests those whose ids begin
-// so; with any other, and where the search fails, the id is typed.
+// The field for a person's id, and who is enrolled under it, where the key may know.
 
-import { command, field, h, newId, plural, when } from "./dom.js";
+import { command, field, h, plural, when } from "./dom.js";
 import { LIFTS, call, may, session } from "./service.js";
 import { lacking } from "./words.js";
 
-const SHOWN = 8;
 const PAUSE_MS = 200;
 
 // A page of people whose ids begin so.
 export const people = (prefix, { limit, cursor, signal }) =>
   call("GET", `/v1/subjects?${new URLSearchParams({ prefix, limit, ...(cursor ? { cursor } : {}) })}`, { signal });
+
+// Who is enrolled under this very id, or null: the first of those whose ids begin so.
+export async function personOf(id, signal) {
+  const [first] = (await people(id, { limit: 1, signal })).subjects;
+  return first?.subject_id === id ? first : null;
+}
 
 export const about = (person) => [
   person.enrolled_by === "photos" ? `${plural(person.photos, "photo", "photos")}, ` : "lifted by a client, ",
@@ -26,10 +30,6 @@ export function whyOff(right) {
   return "This service runs without a model pack: it accepts lifted templates but no photos.";
 }
 
-// The next step where nobody is enrolled under an id.
-export const enroller = (id) =>
-  h("p", { class: "row" }, h("a", { class: "button", href: `#/enroll/${encodeURIComponent(id)}` }, `Enroll ${id}`));
-
 export function offNote(why) {
   if (!why) return null;
   const [reason, typed] = why.split(/(?=veilface )/);
@@ -39,13 +39,16 @@ export function offNote(why) {
 // Where private mode is missing, photos are not sent in silence.
 export const switchOf = (mode) =>
   mode?.root ??
-  offNote(LIFTS && !session.mode && "Private mode could not be loaded: photos are sent to the service. Reload the page.");
+  offNote(
+    LIFTS && !session.mode &&
+      (session.client
+        ? "Private mode could not be loaded: photos are sent to the service. Reload the page."
+        : "Private mode is not offered: this service was installed without the client that it needs (make javascript)."),
+  );
 
 // `input`, its `part` of the form, `id()` in the form in which the service keeps it, and `searched()`, which waits
 // for the search that goes on. `onperson` is called with the person who is enrolled under the id, or null. Searches end with `until`.
 export function subjectField(id, action, onperson, until) {
-  const searches = may("enroll");
-  const list = h("datalist", { id: newId("people") });
   const status = h("p", { class: "hint", role: "status" });
   const input = h("input", {
     type: "text",
@@ -54,13 +57,12 @@ export function subjectField(id, action, onperson, until) {
     autocomplete: "off",
     autocapitalize: "none",
     spellcheck: "false",
-    list: searches ? list.id : null,
     value: id,
   });
   const part = field("Person’s id", input);
+  part.append(status);
   // However it was typed, a passkey of it is the same.
   const typedId = () => input.value.normalize("NFC");
-  if (!searches) return { input, part, id: typedId, searched: async () => {} };
   let running = new AbortController();
   let timer = 0;
   let searching = null;
@@ -68,25 +70,15 @@ export function subjectField(id, action, onperson, until) {
   async function search() {
     timer = 0;
     const { signal } = running;
-    const typed = typedId();
-    // It is an aid: what is wrong, the form says when it is sent.
-    const page = await people(typed, { limit: SHOWN, signal }).catch(() => null);
-    if (signal.aborted) return;
-    const exact = page?.subjects.find((each) => each.subject_id === typed);
-    status.replaceChildren(...(page ? words(page, typed, exact) : []));
-    list.replaceChildren(
-      ...(page?.subjects ?? []).map((each) =>
-        h("option", { value: each.subject_id }, h("span", {}, about(each)).textContent),
-      ),
-    );
-    if (page) onperson(exact ?? null);
-  }
-
-  function words({ subjects, next_cursor: more }, typed, exact) {
-    if (exact) return ["✓ Enrolled: ", ...about(exact)];
-    if (action === "enroll" && typed) return ["New person."];
-    if (!subjects.length) return [typed ? "Nobody is enrolled under this id." : "Nobody is enrolled yet."];
-    return [`${more ? "More than " : ""}${plural(subjects.length, "person", "people")} ${typed ? "found" : "enrolled"}.`];
+    try {
+      const person = typedId() ? await personOf(typedId(), signal) : null;
+      signal.throwIfAborted();
+      const nobody = action === "enroll" ? "New person." : "Nobody is enrolled under this id.";
+      status.replaceChildren(...(person ? ["✓ Enrolled: ", ...about(person)] : typedId() ? [nobody] : []));
+      onperson(person);
+    } catch {
+      // It is an aid: what is wrong, the form says when it is sent.
+    }
   }
 
   function stop() {
@@ -95,15 +87,15 @@ export function subjectField(id, action, onperson, until) {
     running = new AbortController();
   }
 
-  input.addEventListener("input", () => {
-    stop();
-    status.replaceChildren();
-    timer = setTimeout(() => (searching = search()), PAUSE_MS);
-  });
-  input.addEventListener("focus", () => input.value || list.childElementCount || search());
+  if (may("enroll")) {
+    input.addEventListener("input", () => {
+      stop();
+      status.replaceChildren();
+      timer = setTimeout(() => (searching = search()), PAUSE_MS);
+    });
+    if (id) searching = search();
+  }
   until.addEventListener("abort", stop);
-  part.append(list, status);
-  if (id) searching = search();
   async function searched() {
     if (timer) {
       clearTimeout(timer);

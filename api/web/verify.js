@@ -1,9 +1,8 @@
 import { headMovements } from "./challenge.js";
 import { field, folded, h, oneIn, percent } from "./dom.js";
 import { photoForm } from "./form.js";
-import { call, form, levels, may, moves, session, subjectPath } from "./service.js";
-import { enroller } from "./subject.js";
-import { DEMO, livenessWords, problemBox } from "./words.js";
+import { call, form, levels, moves, session, subjectPath } from "./service.js";
+import { DEMO, livenessWords } from "./words.js";
 
 const REASONS = {
   match: "The face matches the enrolled person.",
@@ -34,18 +33,10 @@ export function verifyView(id) {
   );
   const kind = () => (moves() ? "movements" : "photos");
 
-  async function send(name, { photos, ...given }, { lifts, say }) {
+  async function send(name, { photos, ...fields }, say) {
     say("Comparing…");
-    const fields = { level: level.value, ...given };
-    return lifts
-      ? lifts.verify(name, { photos, ...fields })
-      : call("POST", `${subjectPath(name)}/verify`, { body: form("images", photos, fields) });
-  }
-
-  function remedies({ code }, name, { problem, send: button }) {
-    if (code === "locked_out" && may("admin")) return lifter(name, problem, button);
-    if (code === "not_enrolled" && may("enroll")) return [enroller(name)];
-    return [];
+    const body = form("images", photos, { level: level.value, ...fields });
+    return call("POST", `${subjectPath(name)}/verify`, { body });
   }
 
   const view = photoForm(id, {
@@ -61,25 +52,10 @@ export function verifyView(id) {
     moving: moves,
     verb: "Verify",
     send,
+    token: () => ({ level: level.value }),
     show: (name, answer) => decision(name, answer, kind()),
-    remedies,
   });
   return view;
-}
-
-// For operators: the lock is lifted where it was met.
-function lifter(name, problem, button) {
-  const failure = h("div", {});
-  const lift = async () => {
-    try {
-      await call("DELETE", `${subjectPath(name)}/lockout`);
-      problem.replaceChildren(h("p", { class: "off", role: "status" }, `The lock on ${name} is lifted.`));
-      button.focus();
-    } catch (error) {
-      failure.replaceChildren(problemBox(error));
-    }
-  };
-  return [failure, h("button", { type: "button", class: "secondary", onclick: lift }, "Lift the lock")];
 }
 
 function decision(id, answer, kind) {

@@ -1,9 +1,6 @@
 """Forms: whom they are about, photos that are dropped, and what comes late."""
 
-import re
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 from playwright.sync_api import expect
@@ -18,59 +15,28 @@ pytestmark = pytest.mark.long
 
 NAMES = ("found-ada", "found-ben", "found-ben-2")
 DECOMPOSED = "fo\u0308und"
-DROP = """
-async ([selector, url]) => {
-  const data = new DataTransfer();
-  const add = (parts, name, type) => data.items.add(new File(parts, name, { type }));
-  if (url === "text") data.setData("text/plain", "dragged");
-  else if (url === "key file") add(["key"], "key.txt", "text/plain");
-  else add([await (await fetch(url)).blob()], "dropped.png", "image/png");
-  const target = document.querySelector(selector);
-  const options = { bubbles: true, cancelable: true, dataTransfer: data };
-  const over = !target.dispatchEvent(new DragEvent("dragover", options));
-  return [over, !target.dispatchEvent(new DragEvent("drop", options))];
-}
-"""
-"""Drop a picture, a key file or text on an element; whether the page takes it over from the browser
-while it is above, and when it is dropped."""
 
 
-@pytest.fixture
-def enrolled(demo: Served) -> Iterator[None]:
-    """Three people whose ids begin alike."""
-    for name in NAMES:
-        enroll(demo, name, "person-2")
-    yield
-    with demo.client() as client:
-        for name in NAMES:
-            assert client.delete(f"/v1/subjects/{name}").is_success
-
-
-@pytest.mark.usefixtures("enrolled")
-def test_people_whose_ids_begin_so_are_suggested(open_tab: OpenTab, demo: Served) -> None:
-    tab = open_tab(demo)
-    page = tab.page
-    field = page.get_by_label("Person’s id")
-    suggested = page.locator(f"datalist#{field.get_attribute('list')} option")
-    field.press_sequentially("found-")
-    expect(suggested).to_have_count(3)
-    expect(suggested.last).to_have_text(re.compile("^1 photo, "))
-    expect(page.get_by_text("3 people found.")).to_be_visible()
-    # One that is enrolled is enough said, though another id begins with it.
-    field.fill("found-ben")
-    expect(page.get_by_text("✓ Enrolled: 1 photo")).to_be_visible()
+def test_the_field_says_who_is_enrolled_under_an_id(open_tab: OpenTab, demo: Served) -> None:
+    enroll(demo, "found-ben", "person-2")
     # As the service does, the page reads an id in Unicode's form NFC.
     enroll(demo, DECOMPOSED, "person-2")
-    field.fill(DECOMPOSED)
-    expect(page.get_by_text("✓ Enrolled: 1 photo")).to_be_visible()
+    tab = open_tab(demo)
+    page = tab.page
+    enrolled = page.get_by_text("✓ Enrolled: 1 photo")
+    for name in ("found-ben", DECOMPOSED):
+        tab.name_person(name)
+        expect(enrolled).to_be_visible()
+        tab.name_person(name[:-1])
+        expect(page.get_by_text("Nobody is enrolled under this id.")).to_be_visible()
     with demo.client() as client:
-        assert client.delete(f"/v1/subjects/{DECOMPOSED}").is_success
+        for name in ("found-ben", DECOMPOSED):
+            assert client.delete(f"/v1/subjects/{name}").is_success
     # A search that fails says nothing: the form does, when it is sent.
     page.route("**/v1/subjects?*", lambda route: route.abort())
     with page.expect_event("requestfailed"):
-        field.fill("found-a")
-    expect(page.get_by_text("✓ Enrolled")).to_have_count(0)
-    expect(suggested).to_have_count(0)
+        tab.name_person("found-a")
+    expect(enrolled).to_have_count(0)
     tab.open("People")
     tab.is_refused("The service does not respond.", "unreachable")
     assert set(tab.complaints) == {"Failed to load resource: net::ERR_FAILED"}
@@ -124,26 +90,22 @@ def test_an_enrollment_is_replaced_only_where_the_visitor_says_so(
 
 
 @pytest.mark.parametrize(
-    ("status", "code", "details", "says"),
+    ("status", "code", "says"),
     [
-        (403, "forbidden", {"missing": ["verify"]}, "a key that has this right"),
-        (403, "forbidden", {"lowest_level": "fmr-1e-3"}, "Choose a stricter level"),
-        (403, "forbidden", {"tenant_setting": "x"}, "Switch private mode off"),
-        (403, "forbidden", {"liveness": "passive"}, "Reload the page"),
-        (403, "forbidden", {}, "Ask the operator whether this key may do it."),
-        (503, "model_unavailable", {}, "Try again in a moment."),
+        (403, "forbidden", "a key that may do this"),
+        (503, "model_unavailable", "Try again in a moment."),
     ],
 )
 def test_a_refusal_says_what_helps(
-    open_tab: OpenTab, demo: Served, status: int, code: str, details: dict[str, Any], says: str
+    open_tab: OpenTab, demo: Served, status: int, code: str, says: str
 ) -> None:
     tab = open_tab(demo)
-    answer = refused(status, code, "it is refused", **details)
+    answer = refused(status, code, "it is refused")
     tab.page.route("**/verify", lambda route: route.fulfill(**answer))
     tab.name_person("person-2")
     tab.choose_drawn("person-2", 1)
     tab.press("Verify")
-    tab.is_refused(code, says)
+    tab.is_refused("It is refused.", code, says)
     tab.complaints[:] = [each for each in tab.complaints if "status of 503" not in each]
 
 
@@ -170,23 +132,17 @@ def test_a_receipt_is_good_for_the_contract_beside_it(
     assert checked.status == 0, checked.stderr
 
 
-def test_photos_are_dropped_on_the_form(open_tab: OpenTab, demo: Served) -> None:
+def test_what_is_no_picture_or_one_too_many_is_not_taken(open_tab: OpenTab, demo: Served) -> None:
     tab = open_tab(demo)
-    page = tab.page
     tab.open("Enroll")
-    url = "/demo/people/person-1/0.png"
-    for count in (1, 2):
-        assert page.evaluate(DROP, ["form", url]) == [True, True]
-        tab.good(count)
-    # What misses the form is taken by nobody, and does not replace the page.
-    assert page.evaluate(DROP, ["h1", url]) == [True, True]
-    assert page.evaluate(DROP, ["h1", "text"]) == [False, False]
-    # What is no picture is not sent anywhere.
-    assert page.evaluate(DROP, ["form", "key file"]) == [True, True]
-    expect(page.get_by_text("No picture: key.txt.")).to_be_visible()
-    expect(page.locator(".tray li")).to_have_count(2)
-    # Where the form is switched off, it takes nothing.
-    tab.sign_in(demo.key("verify"))
-    tab.open("Enroll")
-    page.evaluate(DROP, ["form", url])
-    expect(page.locator(".tray li")).to_have_count(0)
+    tab.choose_files({"name": "key.txt", "mimeType": "text/plain", "buffer": b"key"})
+    expect(tab.page.get_by_text("No picture: key.txt.")).to_be_visible()
+    expect(tab.page.locator(".tray li")).to_have_count(0)
+    assert not [url for url in tab.requests if url.endswith("/v1/photos/check")]
+    # New photos take the place of those before; of too many, the first are taken.
+    tab.open("Verify")
+    people = demo.settings.data_dir / "people" / "person-2"
+    photos = sorted(people.glob("*.png"))
+    tab.choose_files(*(photos[n % len(photos)] for n in range(6)))
+    expect(tab.page.locator(".tray li")).to_have_count(5)
+    expect(tab.page.get_by_text("No more than 5 photos: these are the first.")).to_be_visible()

@@ -187,26 +187,3 @@ def test_an_ip_address_has_no_passkeys(open_tab: OpenTab, demo: Served) -> None:
     tab.page.get_by_text("Options:").click()
     expect(tab.page.get_by_label("Lock to a passkey")).to_be_disabled()
     expect(tab.page.get_by_text("Passkeys belong to a host name")).to_be_visible()
-
-
-def test_what_keeps_a_passkey_from_being_used_is_said(visit: Visit) -> None:
-    visitor = visit()
-    tab, page = visitor.tab, visitor.tab.page
-    visitor.authenticator.exchange(prf=False)
-    visitor.enroll()
-    tab.is_refused("passkey_unsupported", "no PRF extension")
-    visitor.authenticator.exchange()
-    visitor.authenticator.refuse()
-    tab.press("Enroll")
-    tab.is_refused("passkey_refused", "cancelled, timed out")
-    assert visitor.sent("/enrollment") == 0
-    visitor.authenticator.exchange()
-    # An attempt that failed leaves one passkey, which the next one takes.
-    page.route("**/enrollment", lambda route: route.abort())
-    tab.press("Enroll")
-    tab.is_refused("unreachable")
-    page.unroute("**/enrollment")
-    tab.complaints.remove("Failed to load resource: net::ERR_FAILED")
-    tab.press("Enroll")
-    tab.is_decided("accept")
-    assert visitor.authenticator.passkeys() == 1
