@@ -205,37 +205,23 @@ def test_an_error_says_which_photo_and_which_right(service: Running, token: str)
         assert forbidden.value.details["missing"] == ["enroll"]
 
 
-KEY = new_holder_key()
-NO_SUBJECT = ["", ".", "..", "a/b", "../x", "a?b", "a b", "a%", "x" * 129]
-NO_TEMPLATE = ["", '"', "*", "a b"]
-NO_KEY = [b"", KEY[:31], KEY + b"x", KEY.hex()]
-
-
 @pytest.mark.parametrize(
-    ("call", "arguments", "options", "message"),
+    ("call", "arguments", "message"),
     [
-        *(("describe", (subject,), {}, "subject id") for subject in NO_SUBJECT),
-        ("verify", ("a/b", b"x"), {}, "subject id"),
-        ("create_token", ("a/b", "verify"), {}, "subject id"),
-        ("token_outcome", ("tina", "../tina"), {}, "token_id"),
-        *(
-            ("enroll", ("ida", b"x"), {"replace": each}, "replace is True, False, or")
-            for each in NO_TEMPLATE
-        ),
-        *(("verify", ("kept", b"x"), {"holder_key": key}, "32 bytes") for key in NO_KEY),
-        *(("verify", ("anna", each), {}, "a photo") for each in (b"", io.StringIO("text"), 3)),
-        ("enroll", ("anna", []), {}, "at least one"),
+        *(("describe", (subject,), "subject id") for subject in ("", ".", "..", "a/b", "../x")),
+        ("verify", ("a/b", b"x"), "subject id"),
+        *(("verify", ("anna", each), "a photo") for each in (b"", io.StringIO("text"), 3)),
+        ("enroll", ("anna", []), "at least one"),
     ],
 )
 def test_what_cannot_be_sent_is_refused_here(
-    call: str, arguments: tuple[Any, ...], options: dict[str, Any], message: str
+    call: str, arguments: tuple[Any, ...], message: str
 ) -> None:
     with (
         Client("http://127.0.0.1:9", "vf_x") as client,
-        pytest.raises((ValueError, TypeError), match=message) as refused,
+        pytest.raises((ValueError, TypeError), match=message),
     ):
-        getattr(client, call)(*arguments, **options)
-    assert KEY.hex()[:8] not in str(refused.value)
+        getattr(client, call)(*arguments)
 
 
 def test_a_file_that_is_absent() -> None:

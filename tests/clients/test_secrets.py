@@ -1,10 +1,6 @@
-"""The API key is in no text that this package makes; the package needs httpx and pydantic alone."""
+"""The API key is in no text that this package makes, and goes to the service alone."""
 
-import ast
-import importlib.metadata
 import logging
-import re
-import sys
 import traceback
 from pathlib import Path
 
@@ -17,7 +13,6 @@ from tests.clients.conftest import Running
 from veilface_client import AsyncClient, Client, PrivateClient, VeilfaceError
 from veilface_client.results import Enrollable, Export, Generator, Probe
 
-PACKAGE = Path(veilface_client.__file__).parent
 SECRET = "5e" * 32
 TOKEN = f"vf_{'0' * 12}_{SECRET}"
 
@@ -92,27 +87,3 @@ def test_redirections_are_not_followed() -> None:
     ):
         client.contract()
     assert seen == ["http://service.test/v1/contract"]
-
-
-def imported(path: Path) -> set[str]:
-    """Top-level modules that a file imports."""
-    names = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Import):
-            names |= {alias.name.split(".")[0] for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            names.add((node.module or "").split(".")[0])
-    return names
-
-
-def test_it_imports_httpx_and_pydantic_alone_and_to_lift_the_extra() -> None:
-    files = sorted(PACKAGE.rglob("*.py"))
-    assert len(files) > 5
-    rest = {path.name: imported(path) - set(sys.stdlib_module_names) for path in files}
-    lifting = rest.pop("lifting.py")
-    assert set().union(*rest.values()) == {"httpx", "pydantic", "veilface_client"}
-    assert lifting == {"enroll", "models", "numpy", "templates", "veilface", "veilface_client"}
-    stated = importlib.metadata.requires("veilface-client") or []
-    assert [each for each in stated if "extra" in each] == ["veilface; extra == 'private'"]
-    plain = sorted(re.split(r"[<>=]", each)[0] for each in stated if "extra" not in each)
-    assert plain == ["httpx", "pydantic"]

@@ -1,11 +1,15 @@
 """The page asks for head movements where the service does, and takes frames by the clock."""
 
 import re
+from pathlib import Path
 
 import pytest
+from PIL import Image
 from playwright.sync_api import expect
 
+from tests.marked_heads import draw, head
 from tests.web.browser_tab import BrowserTab
+from tests.web.camera import SIZE, FakeCamera
 from tests.web.conftest import OpenTab
 from tests.web.deployments import ANNA
 from tests.web.moving_head import camera_script
@@ -61,6 +65,17 @@ def test_who_follows_the_movements_is_accepted(open_tab: OpenTab, moving: Served
     assert page.evaluate("window.cameraTrack.readyState") == "ended"
     expect(page.locator(".movement")).to_be_hidden()
     expect(page.get_by_role("button", name=START)).to_be_enabled()
+
+
+def test_a_photo_before_the_browsers_own_camera_is_rejected(
+    open_tab: OpenTab, moving: Served, camera: FakeCamera, tmp_path: Path
+) -> None:
+    still = tmp_path / "still.png"
+    Image.fromarray(draw(head(), ANNA)).resize((SIZE[1], SIZE[1])).save(still)
+    camera.shows(still)
+    tab = opened(open_tab, moving)
+    tab.press(START)
+    expect(tab.page.locator(".verdict.reject")).to_contain_text("failed (no turn)")
 
 
 def test_leaving_ends_the_camera_and_sends_nothing(open_tab: OpenTab, moving: Served) -> None:

@@ -13,7 +13,7 @@ from typing import Any, Concatenate, ParamSpec, Self, TypedDict, TypeVar, Unpack
 import httpx
 
 from veilface_client import results
-from veilface_client.calls import Calls, PhotoCalls, PrivateCalls, Retries
+from veilface_client.calls import Calls, Channel, PhotoCalls, PrivateCalls, Retries
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -72,7 +72,8 @@ class AsyncClient(PhotoCalls):
 
     def __init__(self, url: str, token: str, **options: Unpack[Options]) -> None:
         self._http = httpx.AsyncClient(**_connection(url, token, options))
-        super().__init__(_AsyncChannel(self._http), options.get("retries"))
+        channel = Channel(self._http.request, asyncio.sleep, asyncio.to_thread)
+        super().__init__(channel, options.get("retries"))
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({str(self._http.base_url)!r})"
@@ -88,34 +89,17 @@ class AsyncClient(PhotoCalls):
         await self._http.aclose()
 
 
-class _AsyncChannel:
-    def __init__(self, http: httpx.AsyncClient) -> None:
-        self._http = http
+def _at_once(function: Callable[P, T]) -> Callable[P, Coroutine[Any, Any, T]]:
+    """Make a coroutine function that blocks and is never suspended."""
 
-    async def request(self, method: str, path: str, **content: Any) -> httpx.Response:
-        return await self._http.request(method, path, **content)
+    async def call(*args: P.args, **kwargs: P.kwargs) -> T:
+        return function(*args, **kwargs)
 
-    async def sleep(self, seconds: float) -> None:
-        await asyncio.sleep(seconds)
-
-    async def run(self, function: Callable[..., T], *args: Any) -> T:
-        return await asyncio.to_thread(function, *args)
+    return call
 
 
-class _BlockingChannel:
-    """Never suspends a coroutine: it blocks instead."""
-
-    def __init__(self, http: httpx.Client) -> None:
-        self._http = http
-
-    async def request(self, method: str, path: str, **content: Any) -> httpx.Response:
-        return self._http.request(method, path, **content)
-
-    async def sleep(self, seconds: float) -> None:
-        time.sleep(seconds)
-
-    async def run(self, function: Callable[..., T], *args: Any) -> T:
-        return function(*args)
+def _call(function: Callable[..., T], *args: Any) -> T:
+    return function(*args)
 
 
 def _blocking(
@@ -142,6 +126,7 @@ class _Session:
 
     def __init__(self, url: str, token: str, options: Options) -> None:
         self._http = httpx.Client(**_connection(url, token, options))
+        self._channel = Channel(_at_once(self._http.request), _at_once(time.sleep), _at_once(_call))
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({str(self._http.base_url)!r})"
@@ -202,7 +187,7 @@ class Client(_Session):
 
     def __init__(self, url: str, token: str, **options: Unpack[Options]) -> None:
         super().__init__(url, token, options)
-        self._calls = PhotoCalls(_BlockingChannel(self._http), options.get("retries"))
+        self._calls = PhotoCalls(self._channel, options.get("retries"))
 
     enroll = _blocking(PhotoCalls.enroll)
     challenge = _blocking(PhotoCalls.challenge)
@@ -235,8 +220,8 @@ class PrivateClient(_Session):
         **options: Unpack[Options],
     ) -> None:
         super().__init__(url, token, options)
-        channel = _BlockingChannel(self._http)
-        self._calls = PrivateCalls(channel, options.get("retries"), pack=Path(pack), dim=dim)
+        retries = options.get("retries")
+        self._calls = PrivateCalls(self._channel, retries, pack=Path(pack), dim=dim)
 
     enroll = _blocking(PrivateCalls.enroll)
     verify = _blocking(PrivateCalls.verify)

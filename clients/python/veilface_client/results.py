@@ -77,7 +77,13 @@ class Enrollment(Answer):
     contract_id: str
     replaced: bool
     holder_key: bool = False
-    images: tuple[PhotoUsed, ...]
+    images: tuple[PhotoUsed, ...] = ()
+
+
+class Imported(Enrollment):
+    """The subject of an export is enrolled."""
+
+    subject_id: str
 
 
 class Decision(Answer):
@@ -250,16 +256,6 @@ class Export(Answer):
     export: str = Field(repr=False)
     contract_id: str
     key_id: str
-
-
-class Imported(Answer):
-    """The subject of an export is enrolled."""
-
-    subject_id: str
-    template_id: str
-    contract_id: str
-    replaced: bool
-    holder_key: bool = False
 
 
 class Health(Answer):
