@@ -460,11 +460,12 @@ def _open_the_store(traces: ServiceTraces) -> None:
         for subject in traces.subjects:
             opened = store.subjects.get("default", subject)
             assert opened is not None
-            n, m = opened.record.n, opened.record.m
+            subspace = decode(opened.wire).subspace
+            m, n = subspace.basis.shape
             payload = np.frombuffer(opened.wire[-2 * n * (m + 1) :], dtype="<f2")
             rows = payload.astype(np.float64).reshape(m + 1, n)
             # The reader's foot point agrees: these are the arrays of the format, foot first.
-            assert np.allclose(decode(opened.wire).subspace.foot, rows[0], atol=1e-3)
+            assert np.allclose(subspace.foot, rows[0], atol=1e-3)
             traces.templates[subject] = OpenedTemplate(rows, rotation.of(opened.template_id))
         pseudonym = store.signer.pseudonym("default", traces.subjects[0])
     finally:
