@@ -134,7 +134,7 @@ class EnrollmentJson(Body):
 class VerifyForm(Body):
     """Photos of one person, as `image` or as `images`."""
 
-    image: Photos = Field([], max_length=MAX_PROBE_PHOTOS)
+    image: Photos = Field([], max_length=MAX_FRAMES)
     images: Photos = Field([], max_length=MAX_FRAMES)
     challenge_id: Annotated[str, Field(min_length=1, max_length=1024)] | None = Field(
         None,
