@@ -64,6 +64,7 @@ def calibrate(
     cohort_seed: bytes | None = None,  # a contract's, to keep its cohort
     recorded: Mapping[str, Json] | None = None,  # facts for the contract file
     dataset: str = "labelled folder",
+    excluded_photos: int = 0,  # of the data set, for the contract file
     progress: Progress = lambda _what, _share: None,  # of the whole, from 0 to 1
 ) -> Calibrated:
     """Calibrate a contract on the private templates of labelled people.
@@ -140,6 +141,7 @@ def calibrate(
             "photos": len(data),
             "people": len(plan.people),
             "templates": len(plan.compared),
+            "excluded_photos": excluded_photos,
             "photos_per_enrollment": options.photos_per_enrollment,
             "protocol": options.protocol,
             "seed": options.seed,

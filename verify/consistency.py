@@ -92,13 +92,18 @@ def match_cosine(
     return lax_and_strict(impostor)[0]
 
 
-def lax_and_strict(impostor: NDArray[np.float32]) -> tuple[float, float]:
-    """Find the raw cosines at FMR 1e-3, or at what ten pairs exceed, and at FMR 1e-6."""
+def lax_and_strict(
+    impostor: NDArray[np.float32], strict_fmr: float = STRICTEST_FMR
+) -> tuple[float, float]:
+    """Find the raw cosines at FMR 1e-3, or at what ten pairs exceed, and at ``strict_fmr``.
+
+    The second is extrapolated: the tail beyond the first is taken as exponential.
+    """
     lax_fmr = min(0.5, max(LAXEST_FMR, _TAIL / impostor.size))
     lax = threshold_at_fmr(impostor, lax_fmr)
     excess = impostor[impostor >= np.float64(lax)].astype(np.float64) - lax
     mean_excess = float(excess.mean()) if excess.size else 0.0
-    return lax, lax + mean_excess * float(np.log(lax_fmr / STRICTEST_FMR))
+    return lax, lax + mean_excess * float(np.log(lax_fmr / strict_fmr))
 
 
 def _genuine_agreements(

@@ -27,13 +27,20 @@ class LabelledFolder:
     paths: tuple[Path, ...]
     identities: tuple[str, ...]
     ignored: tuple[str, ...]
+    excluded: int = 0  # photos, by `without`
 
     def __len__(self) -> int:
         return len(self.paths)
 
-    def without(self, people: Collection[str]) -> "LabelledFolder":
-        """Leave people out, by their names."""
-        return self.having({name: a for name, a in self.albums.items() if name not in people})
+    def without(self, names: Collection[str]) -> "LabelledFolder":
+        """Leave people out by their names, and photos by their paths below ``root``."""
+        albums = {
+            name: [path for path in album if path.relative_to(self.root).as_posix() not in names]
+            for name, album in self.albums.items()
+            if name not in names
+        }
+        kept = self.with_albums(albums)
+        return replace(kept, excluded=len(self) - len(kept))
 
     @property
     def people(self) -> int:
@@ -48,7 +55,7 @@ class LabelledFolder:
             albums.setdefault(name, []).append(path)
         return albums
 
-    def having(self, albums: Mapping[str, Sequence[Path]]) -> "LabelledFolder":
+    def with_albums(self, albums: Mapping[str, Sequence[Path]]) -> "LabelledFolder":
         """Return the folder with these photos of these people."""
         pairs = [(path, name) for name, album in albums.items() for path in album]
         return replace(

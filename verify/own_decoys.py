@@ -10,11 +10,21 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from templates.decoys import DecoyGenerator, DecoySource
+from templates.decoys import DecoyGenerator, DecoyPool, DecoySource
 from templates.errors import ContractError
+from verify.consistency import impostor_cosines, lax_and_strict
+from verify.evaluation.attributes import resembling_rows
 
 LEAST_DEVIATIONS = 4
 """Standard deviations below chance from which on axes correlate too little."""
+MOST_PEOPLE = 0.02
+"""Share of the people who may have an entry of a pool that looks like them."""
+
+_REMEDY = (
+    "such a calibration says nothing about people who are not among the decoys. Build the decoys "
+    "from other people's photos of the same kind, or leave these people out (`decoys build "
+    "--exclude`, `calibrate --exclude-people`)"
+)
 
 
 def was_fitted_to(generator: DecoyGenerator, embeddings: NDArray[np.floating]) -> bool:
@@ -45,18 +55,27 @@ def was_fitted_to(generator: DecoyGenerator, embeddings: NDArray[np.floating]) -
 def require_others(
     source: DecoySource, embeddings: NDArray[np.float32], identities: Sequence[str]
 ) -> None:
-    """Refuse a generator that was fitted to the people of a calibration, or to most of them.
+    """Refuse decoys that were made of the people of a calibration.
 
-    ``embeddings`` are (N, n) float32 unit rows of the calibration, without those that are left out
-    of it, and ``identities`` their N names. Of a pool no privacy is shown, whoever is in it.
+    A generator must not be fitted to them or most of them, a pool not hold more of them than by
+    chance. ``embeddings`` are (N, n) float32 unit rows of the calibration, without those that are
+    left out of it, and ``identities`` their N names.
     """
-    firsts = np.unique(np.asarray(identities, dtype=np.str_), return_index=True)[1]
+    _, firsts, person = np.unique(
+        np.asarray(identities, dtype=np.str_), return_index=True, return_inverse=True
+    )
     if isinstance(source, DecoyGenerator) and any(
         was_fitted_to(source, rows) for rows in (embeddings, embeddings[firsts])
     ):
         raise ContractError(
-            "the decoys were made of the photos of these people, or of most of them: such a "
-            "calibration says nothing about people who are not among the decoys. Build the decoys "
-            "from other people's photos of the same kind, or leave these people out (`decoys build "
-            "--exclude`, `calibrate --exclude-people`)"
+            "the decoys were made of the photos of these people, or of most of them: " + _REMEDY
         )
+    if isinstance(source, DecoyPool):
+        impostor = impostor_cosines(embeddings, person, rng=np.random.default_rng(0))
+        # At this FMR half of `MOST_PEOPLE` resemble an entry by chance.
+        _, likeness = lax_and_strict(impostor, MOST_PEOPLE / 2 / len(source))
+        known = len(resembling_rows(embeddings[firsts], source.entries[0], cosine=likeness))
+        if known > max(1, MOST_PEOPLE * len(firsts)):
+            raise ContractError(
+                f"the decoy pool seems to hold {known} of these {len(firsts)} people: {_REMEDY}"
+            )

@@ -9,7 +9,7 @@ import typer
 from api.cli import flags
 from api.cli.bulk import BULK, Bulk, each_person_once, listed_numbers
 from api.cli.calibration import DEFAULT_PROBE_DIM, calibrate_folder
-from api.cli.console import demo_notice, share_done
+from api.cli.console import demo_notice, message, share_done
 from api.cli.errors import UsageError
 from api.cli.files import read_names
 from api.cli.liveness import set_liveness_threshold, with_liveness_of
@@ -124,7 +124,12 @@ def calibrate(
         raise UsageError("--worst-group needs to know the groups: give --labels")
     known = None if labels is None else read_labels(labels)
     source = bulk.decoys(decoys)
-    labelled = people_or_faces(folder).without(read_names(exclude_people))
+    found = people_or_faces(folder)
+    excluded = read_names(exclude_people)
+    below = {path.relative_to(found.root).as_posix() for path in found.paths}
+    if unknown := sorted(excluded.difference(found.identities, below)):
+        message(f"note: --exclude-people: {len(unknown):,} match nothing, as {unknown[0]!a}")
+    labelled = found.without(excluded)
     extraction = bulk.extract(labelled.paths)
     if labelled.people == len(labelled):
         extraction = each_person_once(extraction)

@@ -98,6 +98,7 @@ def calibrate_folder(
             labels=labels,
             recorded=recorded_of(pack),
             dataset=folder.root.resolve().name,
+            excluded_photos=folder.excluded,
             progress=lambda _, share: progress(SEARCHED + (1 - SEARCHED) * share),
         )
     accuracy = None

@@ -46,7 +46,7 @@ def labelled_people(folder: Path) -> LabelledFolder:
     distinct = {name: distinct_files(album) for name, album in labelled.albums.items()}
     copies = len(labelled) - sum(map(len, distinct.values()))
     _note_unread(folder, labelled.ignored, copies=copies)
-    return labelled.having(distinct)
+    return labelled.with_albums(distinct)
 
 
 def people_or_faces(folder: Path) -> LabelledFolder:

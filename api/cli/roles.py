@@ -110,7 +110,7 @@ def split_people(labelled: LabelledFolder) -> tuple[list[Path], LabelledFolder]:
     tries = [(photos, is_telling) for photos in SAMPLE_PHOTOS]
     for photos, suffices in [*tries, (SAMPLE_PHOTOS[-1], _has_enough_pairs)]:
         people = bisect_left(photos_so_far, photos) + 1
-        rest = labelled.having({name: albums[name] for name in order[people:]})
+        rest = labelled.with_albums({name: albums[name] for name in order[people:]})
         # Decoys are adapted to so many people at least.
         if MIN_DESCRIPTORS // 2 <= people <= len(order) and suffices(rest):
             return [photo for name in sorted(order[:people]) for photo in albums[name]], rest

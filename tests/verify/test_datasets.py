@@ -25,6 +25,9 @@ def test_people_and_photos_are_listed_in_order(tmp_path: Path) -> None:
     assert folder.ignored == ("Ann/notes.txt", "pairs.txt")
     assert (len(folder), folder.people) == (3, 2)
     assert folder.without({"Bob", "Eve"}).identities == ("Ann",)
+    kept = folder.without({"Ann", "Bob/Bob_0001.jpg"})
+    assert [path.name for path in kept.paths] == ["Bob_0002.jpg"]
+    assert kept.excluded == 2
 
 
 def test_what_is_no_photo_of_a_person_is_left_out_and_named(tmp_path: Path) -> None:

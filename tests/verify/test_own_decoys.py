@@ -47,6 +47,10 @@ def test_a_generator_of_others_is_not(count: int) -> None:
         assert refused(source, people) is None, (calibrated, power)
 
 
-def test_a_pool_is_taken_whoever_is_in_it() -> None:
-    people = drawn(100)
-    assert refused(DecoyPool(people.descriptors), people) is None
+def test_a_pool_that_holds_the_people_is_refused_by_other_photos_of_them_too() -> None:
+    people = drawn(100, photos=2)
+    entries, probes = people.descriptors[::2], People(people.descriptors[1::2], people.names[1::2])
+    assert "the decoy pool seems to hold" in str(refused(DecoyPool(entries), probes))
+    others = drawn(400, seed=5).descriptors
+    assert refused(DecoyPool(others), probes) is None
+    assert refused(DecoyPool(np.concatenate([others, entries[:1]])), probes) is None

@@ -44,7 +44,7 @@ def test_the_demo_model_is_named_and_the_cohort_is_not_shown(world):
 
 def test_people_are_left_out_and_ten_fold_adds_a_level(world, veilface, data, tmp_path):
     listing = tmp_path / "names.txt"
-    listing.write_text("person-6000\nperson-6001\n")
+    listing.write_text("person-6000\nperson-6001\nperson-6002/0.png\nperson-6oo3\n")
     ran = veilface(
         *("calibrate", world.labelled, "--pack", world.pack, "--axes", "32", "--dim", "4"),
         *("--exclude-people", listing, "--protocol", "ten-fold", "--strategy", "hybrid"),
@@ -59,7 +59,8 @@ def test_people_are_left_out_and_ten_fold_adds_a_level(world, veilface, data, tm
         tmp_path / "contract.json", file_sealer(MasterKeyring.load(key_file(data)))
     )
     facts = contract.calibration("p2s").calibrated_on
-    assert facts["people"] == 48
+    assert (facts["people"], facts["photos"], facts["excluded_photos"]) == (48, 191, 9)
+    assert "--exclude-people: 1 match nothing, as 'person-6oo3'" in ran.stderr
     # Half of the people are attacked with the faces of the others.
     assert contract.verdict.privacy.basis["victims"] == 24
     assert contract.calibration("p2s").level("accuracy").target_fmr is None
