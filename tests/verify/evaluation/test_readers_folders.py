@@ -7,6 +7,7 @@ import pytest
 import scipy.io
 
 from tests.verify.evaluation.layouts import (
+    AGEDB_NAMES,
     agedb_folder,
     agedb_folds,
     agedb_splits,
@@ -73,6 +74,8 @@ def test_a_photo_that_is_there_twice_is_refused(tmp_path: Path) -> None:
         ("Ann\t1\t2", "Ann\t1", "line 2 is not of the form Name i j"),
         ("Bob\t1", "Bob\tx", "line 3 is not of the form NameA"),
         ("Bob\t1", "../Bob\t1", "no plain name"),
+        ("Ann\t1\t2", "Ann\t1\t1", "Ann_0001 compares a photo with itself"),
+        ("Bob\t1", "Ann\t1", "labelled as two people, which its names contradict"),
     ],
 )
 def test_lfw_broken_protocols(tmp_path: Path, old: str, new: str, message: str) -> None:
@@ -180,6 +183,7 @@ def test_agedb(tmp_path: Path, layout: str, compressed: bool) -> None:
         ([("a", "b", 0), ("a", "b", -1), ("a", "a", 1)], "fold 10 .*other labels"),
         ([("a", " ", -1), ("a", "a", 1)], "fold 10 .*photo without a name"),
         ([("a/b", "c", 1), ("a", "c", -1)], "no plain name"),
+        ([(*AGEDB_NAMES[1:], 1), (*AGEDB_NAMES[:2], -1)], "as one person, which its names"),
     ],
 )
 def test_agedb_wrong_protocols(

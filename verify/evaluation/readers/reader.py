@@ -151,12 +151,20 @@ def assemble(
     aligned: bool | None = None,
     templates: Mapping[str, Sequence[Photo]] | None = None,
 ) -> VerificationSet:
-    """Number the photos of ``trials`` and check that every fold has both kinds of pairs."""
+    """Number the photos of ``trials``; check each pair, and that a fold has both kinds of them."""
     if not _NAME.fullmatch(name):
         raise DatasetError(
             f"the set {name[:100]!a} has a name of more than 100 characters, or of others than "
             "letters, digits, spaces and _ . ( ) -; rename the file"
         )
+    for trial in trials:
+        pair = f"{name}: the pair of {trial.first} and {trial.second}"
+        # A published .bin cannot be mended, and holds no files.
+        if trial.first == trial.second and kind != "bin":
+            raise DatasetError(f"{pair} compares a photo with itself; remove it")
+        if person is not None and (person(trial.first) == person(trial.second)) != trial.same:
+            people = "one person" if trial.same else "two people"
+            raise DatasetError(f"{pair} is labelled as {people}, which its names contradict")
     keys = keys_of(trials)
     position = {key: place for place, key in enumerate(keys)}
     same = np.array([trial.same for trial in trials], dtype=np.bool_)
