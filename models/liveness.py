@@ -209,24 +209,30 @@ def square_region(box: Box, scale: float) -> tuple[int, int, int]:
 def _square_crop(
     picture: NDArray[np.uint8], box: Box, scale: float, size: int
 ) -> NDArray[np.uint8]:
-    """Cut `square_region`; where it reaches over the border the frame is mirrored."""
+    """Cut `square_region`; where it reaches over the border the frame is mirrored.
+
+    What is in the frame of such a square is reduced before, so that memory does not depend on how
+    far the square reaches.
+    """
     left, top, side = square_region(box, scale)
-    reduction = _FINER * size / side
-    if reduction < 1:
-        # Memory must not depend on how far the square reaches: the frame is reduced first.
-        height, width = (max(1, round(reduction * length)) for length in picture.shape[:2])
-        picture = _resized(picture, width, height, cv2.INTER_AREA)
-        x1, y1, x2, y2 = (reduction * value for value in box)
-        left, top, side = square_region((x1, y1, x2, y2), scale)
-    square = cv2.warpAffine(
-        picture,
-        np.array([[1.0, 0.0, left], [0.0, 1.0, top]]),
-        (side, side),
-        flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
-        borderMode=cv2.BORDER_REFLECT_101,
-    )
+    finer = min(side, _FINER * size)
+    first, last, before, shown = [], [], [], []
+    for start, length in zip((top, left), picture.shape, strict=False):
+        first.append(max(start, 0))
+        last.append(min(start + side, length))
+        before.append(min(finer - 1, round(finer * (first[-1] - start) / side)))
+        shown.append(max(1, finer - before[-1] - round(finer * (start + side - last[-1]) / side)))
+    square = picture[first[0] : last[0], first[1] : last[1]]
+    if square.shape[:2] != (side, side):
+        if finer < side:
+            square = _resized(square, shown[1], shown[0], cv2.INTER_AREA)
+        after = [finer - margin - inside for margin, inside in zip(before, shown, strict=True)]
+        borders = (before[0], after[0], before[1], after[1])
+        square = np.asarray(
+            cv2.copyMakeBorder(square, *borders, cv2.BORDER_REFLECT_101), dtype=np.uint8
+        )
     kind = cv2.INTER_AREA if side > size else cv2.INTER_LANCZOS4
-    return _resized(np.asarray(square, dtype=np.uint8), size, size, kind)
+    return _resized(square, size, size, kind)
 
 
 def _resized(

@@ -95,22 +95,23 @@ def test_the_crop_of_a_box(box, scale):
 
 
 @pytest.mark.parametrize(
-    ("box", "off"),
+    ("box", "size", "off"),
     [
-        ((0.0, 0.0, 40.0, 80.0), 0),
-        ((120.0, 130.0, 190.0, 199.0), 0),
-        # So large a square is reduced first: the border lies on its reduced pixels.
-        ((0.0, 0.0, 199.0, 199.0), 6),
+        ((0.0, 0.0, 40.0, 80.0), 64, 0),
+        ((120.0, 130.0, 190.0, 199.0), 64, 0),
+        ((50.0, 50.0, 150.0, 150.0), 32, 0),
+        # What is seen of so large a square is reduced first: its border lies on reduced pixels.
+        ((0.0, 0.0, 199.0, 199.0), 64, 2),
     ],
 )
-def test_a_square_over_the_border_mirrors_the_frame(box, off):
+def test_a_square_is_exact_and_mirrors_the_frame_over_its_border(box, size, off):
     frame = picture(3, 200, 200)
     left, top, side = square_region(box, 1.5)
     pad = 200
     mirrored = np.pad(frame, ((pad, pad), (pad, pad), (0, 0)), mode="reflect")
     cut = mirrored[top + pad :, left + pad :][:side, :side]
-    expected = cv2.resize(cut, (64, 64), interpolation=cv2.INTER_AREA).astype(int)
-    crop = crop_face(frame, box, shape="square", scale=1.5, size=64).astype(int)
+    expected = cv2.resize(cut, (size, size), interpolation=cv2.INTER_AREA).astype(int)
+    crop = crop_face(frame, box, shape="square", scale=1.5, size=size).astype(int)
     assert np.abs(crop - expected).max() <= off
 
 
