@@ -9,6 +9,7 @@ from pathlib import Path, PurePosixPath
 from models.errors import PackError
 from models.pack_file import FILE_NAME
 
+MAX_ENTRIES = 100
 MAX_FILE_BYTES = 2**30
 MAX_TOTAL_BYTES = 2 * 2**30
 _PIECE = 2**20
@@ -40,6 +41,8 @@ def unpack(archive: Path, into: Path) -> int:
     room = MAX_TOTAL_BYTES
     try:
         with zipfile.ZipFile(archive) as opened:
+            if len(opened.infolist()) > MAX_ENTRIES:
+                raise PackError(f"The archive has more than {MAX_ENTRIES} entries.")
             for entry in opened.infolist():
                 if entry.is_dir():
                     continue

@@ -1,7 +1,9 @@
 """Archives that strangers made: nothing is written but graphs, inside the folder."""
 
+import random
 import stat
 import zipfile
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -78,9 +80,18 @@ def test_a_pack_needs_a_graph_with_a_name_that_can_be_shown(
     assert not list((tmp_path / "into").iterdir())
 
 
-def test_two_graphs_of_one_name_are_refused(tmp_path: Path) -> None:
-    path = zipped(tmp_path, ("a/det.onnx", GRAPH), ("b/det.onnx", b"another"))
-    with pytest.raises(PackError, match="two files of the same name"):
+@pytest.mark.parametrize(
+    ("names", "reason"),
+    [
+        (["a/det.onnx", "b/det.onnx"], "two files of the same name"),
+        ([f"{number}.onnx" for number in range(101)], "more than 100 entries"),
+    ],
+)
+def test_two_graphs_of_one_name_or_too_many_are_refused(
+    tmp_path: Path, names: list[str], reason: str
+) -> None:
+    path = zipped(tmp_path, *((name, GRAPH) for name in names))
+    with pytest.raises(PackError, match=reason):
         unpack(path, target(tmp_path))
 
 
@@ -128,3 +139,23 @@ def test_what_is_neither_stored_nor_deflated_is_refused(tmp_path: Path, method: 
         file.writestr("det.onnx", GRAPH)
     with pytest.raises(PackError, match=r"neither stored nor deflated.*det\.onnx"):
         unpack(path, target(tmp_path))
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
+def test_no_damage_writes_outside_or_fails_otherwise(tmp_path: Path, method: int) -> None:
+    drawn = random.Random(0)
+    path, into = tmp_path / "pack.zip", target(tmp_path)
+    with zipfile.ZipFile(path, "w", method) as file:
+        file.writestr("a/det.onnx", drawn.randbytes(50) * 10)
+        file.writestr("a/\N{GREEK SMALL LETTER ALPHA}.onnx", GRAPH)
+    whole = path.read_bytes()
+    for _ in range(100):
+        data = bytearray(whole)
+        for _ in range(drawn.randint(1, 4)):
+            data[drawn.randrange(len(data))] = drawn.randrange(256)
+        path.write_bytes(data)
+        with suppress(PackError):
+            unpack(path, into)
+        assert sorted(entry.name for entry in tmp_path.iterdir()) == ["into", "pack.zip"]
+        for written in into.iterdir():
+            written.unlink()
