@@ -119,14 +119,16 @@ def test_groups_that_a_contract_cannot_hold_are_refused_before_anything_is_compu
         PhotoLabels({"town": ["\x1b[2J"]}, "drawn")
 
 
-def calibrated_groups(*, worst_group: bool) -> tuple[Calibrated, PhotoLabels]:
-    """Calibrate on 150 people, of whom 40 are alike."""
+def calibrated_groups(
+    *, worst_group: bool, count: int = 40, towards: float = 0.6
+) -> tuple[Calibrated, PhotoLabels]:
+    """Calibrate on 150 people, of whom some are alike."""
     people = draw_people(150)
     numbers = np.array([int(name.rsplit("-", 1)[1]) for name in people.names])
-    alike = numbers < 40
-    towards = unit(np.random.default_rng(9).normal(size=(1, N)))
+    alike = numbers < count
+    centre = unit(np.random.default_rng(9).normal(size=(1, N)))
     rows = people.descriptors.copy()
-    rows[alike] = unit(rows[alike] + 0.6 * towards)
+    rows[alike] = unit(rows[alike] + towards * centre)
     labels = PhotoLabels({"kind": ["alike" if one else "other" for one in alike]}, "drawn")
     source = make_generator()
     done = calibrate(
@@ -188,3 +190,14 @@ def test_the_worst_group_fails_without_the_rule_and_passes_with_it(both) -> None
     single = [contract.calibration("p2s").level("fmr-1e-2") for contract in both[:2]]
     assert single[1].threshold > single[0].threshold
     assert single[1].fnmr.errors >= single[0].fnmr.errors
+
+
+def test_a_stricter_level_is_never_laxer() -> None:
+    """A group that only the laxer target resolves raises the stricter level as well."""
+    done, _ = calibrated_groups(worst_group=True, count=12, towards=1.5)
+    lax, strict = done.contract.calibration("p2s").levels
+    assert strict.threshold == lax.threshold
+    assert any(
+        "FMR 0.01 needs 1000 impostor trials within a group" in line and "kind alike (352)" in line
+        for line in done.report.left_out
+    )
