@@ -1,6 +1,7 @@
 """Decisions against brute force, hostile probes, and subjects that do not exist."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,13 +25,22 @@ from tests.verify.synthetic import (
     N,
     draw_people,
     embeddings_of,
+    make_binding,
     make_generator,
     projected,
     spherical,
     tenant_rotation,
     unit,
 )
-from verify import Calibrated, Decision, StandIn, Verifier, probe_of_embeddings
+from verify import (
+    Calibrated,
+    CalibrationOptions,
+    Decision,
+    StandIn,
+    Verifier,
+    calibrate,
+    probe_of_embeddings,
+)
 
 NEW = draw_people(12, photos=(4,), seed=55)
 ROTATION = tenant_rotation()
@@ -287,6 +297,44 @@ def test_scores_stay_out_of_the_repr(verifier: Verifier, stored: list[Enrollment
     text = repr(decision)
     assert "similarity" not in text
     assert str(decision.distance) not in text
+
+
+def test_wolves_are_stopped_by_what_is_expected_of_them() -> None:
+    """A few axes carry most of the spread of faces: what lies along them is near everybody."""
+    rng = np.random.default_rng(0)
+    spread = np.concatenate([np.full(4, 3.0), np.ones(N - 4)])
+    centres, faces, strangers = (
+        unit(rng.normal(size=(count, N)) * spread) for count in (200, 500, 150)
+    )
+    photos = unit(np.repeat(centres, 3, axis=0) + 0.3 * unit(rng.normal(size=(600, N))))
+    source = DecoyGenerator.fit(faces).reduced(K)
+    contract = calibrate(
+        photos,
+        [f"p{i // 3}" for i in range(600)],
+        binding=make_binding(source.source_id),
+        source=source,
+        options=CalibrationOptions(
+            probe_dims=(0, 4), lifted_probes=200, lifted_impostor_pairs=20_000, steps=20
+        ),
+    ).contract
+    enroller = Enroller(contract, source, rotation=ROTATION, lift_secret=LIFT_SECRET)
+    verifier = Verifier(contract, source, rotation=ROTATION)
+    foot = np.zeros(K, dtype=np.float32)
+    foot[4] = np.mean(contract.calibration("s2s", None, 4).foot_point_norm or ())
+    wolf = SubspaceBatch(foot, np.eye(K, dtype=np.float32)[:4])
+    lifted_wolf = wire.encode(wolf, contract_id=contract.contract_id)
+    raw_wolf = source.axes[:, 0]
+    honest = lifted(contract, strangers[0], m=4, source=source)
+    stored = [enroller.from_embeddings(row) for row in strangers[1:]]
+    kinds: list[tuple[Any, Any, Any]] = [
+        (verifier.decide_template, lifted_wolf, honest),
+        (verifier.decide_embedding, raw_wolf, strangers[0]),
+    ]
+    for decide, wolf_probe, probe in kinds:
+        decisions = [decide(wolf_probe, one, level="fmr-1e-2") for one in stored]
+        usual = [decide(probe, one).similarity for one in stored]
+        assert np.mean([d.similarity for d in decisions]) > np.quantile(usual, 0.7)
+        assert np.mean([d.accepted for d in decisions]) < 0.05
 
 
 def test_photos_of_a_probe_need_to_agree_less_than_those_of_an_enrollment(
