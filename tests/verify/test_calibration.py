@@ -1,6 +1,7 @@
 """Calibration against brute force, and against people that it has not seen."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from enroll import Enroller
 from templates.contract.document import Contract
 from templates.contract.nobody import Nobody
 from templates.decoys import client_source
-from templates.distances import DEFAULT_STEPS, Metric
+from templates.distances import DEFAULT_STEPS, Metric, paired_distances, similarity
 from templates.errors import ContractError, InvalidEmbedding
 from templates.keys.randomness import Keystream
 from templates.space.lifting import lift
@@ -25,14 +26,21 @@ from tests.verify.synthetic import (
     spherical,
     tenant_rotation,
 )
-from verify import Calibrated, CalibrationOptions, Verifier, calibrate
+from verify import Calibrated, CalibrationOptions, Verifier, calibrate, calibration_mode
 from verify.calibration_mode import ACCURACY_LEVEL
+from verify.cohort import Probes
 from verify.comparisons import Comparison, Lifter, honest_norms
+from verify.tenfold import TenFold, ten_fold
 from verify.trials import enrolled_means, plan_trials
 
 
-@pytest.mark.parametrize("most_templates", [None, 9])
-def test_point_trials_agree_with_brute_force(most_templates: int | None) -> None:
+@pytest.mark.parametrize(
+    ("most_templates", "probe_m", "size"), [(None, 0, None), (9, 0, None), (9, 2, 10)]
+)
+def test_trials_agree_with_brute_force(
+    most_templates: int | None, probe_m: int, size: int | None
+) -> None:
+    """Raw probes in one group; lifted ones in groups that meet others, and a last short group."""
     people = draw_people(12)
     source = make_generator()
     rng = np.random.default_rng(0)
@@ -46,28 +54,39 @@ def test_point_trials_agree_with_brute_force(most_templates: int | None) -> None
     templates = lifter.lift(means, m=6, stream=stream)
     nobody = Nobody(source, lifter.strategy, 6, bytes(32))
     points = source.project(people.descriptors)
+    probes: Probes = points
+    if probe_m:
+        probes = lifter.lift(people.descriptors, m=probe_m, stream=stream)
+    met = plan.compared[None]
+    if size is not None:
+        groups = range(0, len(points), size)
+        met = np.stack([np.sort(rng.choice(plan.compared, 5, replace=False)) for _ in groups])
+        assert 0 < len(points) % size < size < len(points)
     comparison = Comparison(plan, templates, nobody, Metric.SPHERICAL, DEFAULT_STEPS)
-    expected = means, spreads = comparison.expected(points)
+    expected = means, spreads = comparison.expected(probes)
     impostors = comparison.impostors(
-        points, expected, plan.person_of, plan.compared[None], size=len(points),
+        probes, expected, plan.person_of, met, size=size or len(points),
         progress=lambda _share: None,
     )  # fmt: skip
     owners = plan.person_of[plan.genuine]
     genuine = comparison.genuine(
-        points[plan.genuine], (means[plan.genuine], spreads[plan.genuine]), owners,
+        probes[plan.genuine], (means[plan.genuine], spreads[plan.genuine]), owners,
         np.zeros(len(owners), dtype=bool),
     )  # fmt: skip
 
     def score(photo: int, person: int) -> float:
         template = templates[compared.index(person)]
         close = spherical(points[photo], template)
+        if probe_m:
+            pair = probes[photo : photo + 1], SubspaceBatch.of([template])
+            (close,) = similarity(paired_distances(*pair, metric=Metric.SPHERICAL))
         return float((close - means[photo]) / spreads[photo])
 
     photos = range(len(people.names))
     trials = {
         (photo, person): score(photo, person)
         for photo in photos
-        for person in compared
+        for person in met[photo // (size or len(points))].tolist()
         if person != plan.person_of[photo]
     }
     seen = [(plan.person_of[photo], person) for photo, person in trials]
@@ -79,7 +98,9 @@ def test_point_trials_agree_with_brute_force(most_templates: int | None) -> None
     assert sorted(map(tuple, impostors.people_of(cells))) == sorted(seen)
     for cell in cells[::7]:
         owner, person = impostors.people_of(cell[None])[0]
-        own = [trials[photo, person] for photo in photos if plan.person_of[photo] == owner]
+        own = [
+            z for (i, other), z in trials.items() if (plan.person_of[i], other) == (owner, person)
+        ]
         assert np.abs(np.array(own) - impostors.scores[cell]).min() < 2e-4
     assert impostors.person_pairs == len({frozenset(map(int, pair)) for pair in seen})
     weights = rng.integers(0, 4, 12).astype(float)
@@ -182,15 +203,23 @@ def test_the_cohort_is_new_every_time_and_the_rest_follows_the_seed() -> None:
     assert first.photo_consistency == second.photo_consistency
 
 
-def test_ten_fold_adds_the_accuracy_level(people: People) -> None:
+def test_ten_fold_adds_the_accuracy_level(people: People, monkeypatch: pytest.MonkeyPatch) -> None:
+    runs: list[TenFold] = []
+
+    def noted(*pairs: Any) -> TenFold:
+        runs.append(ten_fold(*pairs))
+        return runs[-1]
+
+    monkeypatch.setattr(calibration_mode, "ten_fold", noted)
     options = CalibrationOptions(protocol="ten-fold", probe_dims=(0,))
     result = calibrate_people(people, options=options)
     calibration = result.contract.calibrations[0]
     level = calibration.level(ACCURACY_LEVEL)
     assert level.target_fmr is None
-    accuracy = calibration.calibrated_on["ten_fold_accuracy"]
-    assert isinstance(accuracy, float)
-    assert accuracy > 0.95
+    (folds,) = runs
+    assert level.threshold == pytest.approx(np.mean(folds.thresholds))
+    assert calibration.calibrated_on["ten_fold_accuracy"] == pytest.approx(folds.accuracy_mean)
+    assert folds.accuracy_mean > 0.95
     other = calibration.level("fmr-1e-2")
     assert (level.fmr.value < other.fmr.value) == (level.threshold > other.threshold)
 

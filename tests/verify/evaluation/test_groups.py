@@ -68,15 +68,18 @@ def test_the_worst_group_is_named_with_its_interval():
     assert summary["fnmr_ratio"] == pytest.approx(0.05 / gmean([10 / 200, 4 / 400]))
 
 
-@pytest.mark.parametrize(("errors", "apart"), [(7, False), (8, False), (9, True), (14, True)])
-def test_a_worst_group_is_apart_where_its_widened_interval_is_above_all(errors, apart):
+@pytest.mark.parametrize(
+    ("errors", "groups", "apart"),
+    [(7, 3, False), (8, 3, False), (9, 3, True), (14, 3, True), (10, 2, True), (7, 6, False)],
+)
+def test_a_worst_group_is_apart_where_its_widened_interval_is_above_all(errors, groups, apart):
+    others = "bcdefghij"[: groups - 1]
     _, summary = report(
         trials(True, "a", "a", 500 - errors, errors),
-        trials(True, "b", "b", 995, 5),
-        trials(True, "c", "c", 995, 5),
+        *(trials(True, name, name, 995, 5) for name in others),
     )
-    pooled = (errors + 10) / 2500
-    low = binomtest(errors, 500).proportion_ci(1 - 0.05 / 3, method="wilson").low
+    pooled = (errors + 5 * len(others)) / (500 + 1000 * len(others))
+    low = binomtest(errors, 500).proportion_ci(1 - 0.05 / groups, method="wilson").low
     assert (low > pooled) == apart
     assert summary["worst_fnmr"]["group"] == "a"
     assert summary["worst_fnmr"]["apart"] == apart
