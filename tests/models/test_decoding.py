@@ -196,3 +196,11 @@ def test_nothing_else_escapes_on_flipped_bytes(sample, data):
     for position, mask in flips:
         broken[position] ^= mask
     assert harmless(bytes(broken))
+
+
+@settings(max_examples=150)
+@given(st.sampled_from(SAMPLES), st.floats(0, 1), st.binary(max_size=64))
+def test_nothing_else_escapes_on_cut_and_patched_bytes(sample, share, patch):
+    cut = int(len(sample) * share)
+    assert harmless(sample[:cut])
+    assert harmless(sample[:cut] + patch + sample[cut + len(patch) :])

@@ -316,3 +316,14 @@ def test_a_bystander_is_never_taken_for_a_face_that_fills_the_photo(name, shared
     for picture, right in pictures:
         for policy in (FacePolicy.DOMINANT, FacePolicy.LARGEST):
             assert pack.embed_photo(jpeg(picture), policy=policy).embedding @ right > 0.8
+
+
+def test_yunet_finds_the_left_eye_left_of_the_right_one_above_nose_and_mouth(
+    yunet_pack_dir, lfw_photos
+):
+    pack = ModelPack.load(yunet_pack_dir, threads=1)
+    photo = decode_image(min(lfw_photos.glob("*/*_0001.jpg")).read_bytes())
+    (face, *_) = ranked(pack.detect(photo), photo.shape)
+    left, right, nose, *mouth = face.keypoints
+    assert left[0] < nose[0] < right[0]
+    assert max(left[1], right[1]) < nose[1] < min(corner[1] for corner in mouth)

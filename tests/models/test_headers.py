@@ -1,6 +1,7 @@
 """Which parts of a picture file a decoder gets, and what costs nothing because it does not."""
 
 import struct
+import zlib
 
 import numpy as np
 import pytest
@@ -169,3 +170,13 @@ def test_the_canvas_of_a_webp_file_is_refused_before_its_decoder_starts(name, mo
     error = refusal(data)
     assert "9000 x 9000 pixels" in str(error)
     assert error.code == "image_too_large"
+
+
+@pytest.mark.parametrize(
+    ("name", "head"), [(b"iCCP", b"x\0\0"), (b"iTXt", b"XML:com.adobe.xmp\0\1\0\0\0")]
+)
+def test_profiles_and_texts_of_a_png_are_not_unpacked(name, head, monkeypatch):
+    packed = chunk(name, head + zlib.compress(bytes(10**6)))
+    data = with_chunk(encode(PHOTO), packed * 20, before=b"IDAT")
+    monkeypatch.setattr("PIL.PngImagePlugin._safe_zlib_decompress", None)
+    np.testing.assert_array_equal(decode_image(data), picture())
