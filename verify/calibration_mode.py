@@ -210,6 +210,7 @@ def _calibration(
         "impostor_people_pairs": impostors.person_pairs,
     }
     if folds is not None:
+        facts["pairs"] = "random"
         facts["ten_fold_accuracy"] = folds.accuracy_mean
         facts["ten_fold_std"] = folds.accuracy_std
     where = (

@@ -75,7 +75,10 @@ def calibrate(
     metric: Annotated[Metric, typer.Option(help="The distance that decides.")] = Metric.SPHERICAL,
     protocol: Annotated[
         Protocol,
-        typer.Option(help="`ten-fold` adds the paper's threshold of best accuracy as a level."),
+        typer.Option(
+            help="`ten-fold` adds the paper's threshold of best accuracy, on random pairs, as a "
+            "level."
+        ),
     ] = "fmr",
     aligned: flags.Aligned = False,
     flip: flags.Flip = False,

@@ -217,6 +217,7 @@ def test_ten_fold_adds_the_accuracy_level(people: People, monkeypatch: pytest.Mo
     level = calibration.level(ACCURACY_LEVEL)
     assert level.target_fmr is None
     (folds,) = runs
+    assert calibration.calibrated_on["pairs"] == "random"
     assert level.threshold == pytest.approx(np.mean(folds.thresholds))
     assert calibration.calibrated_on["ten_fold_accuracy"] == pytest.approx(folds.accuracy_mean)
     assert folds.accuracy_mean > 0.95
