@@ -150,16 +150,19 @@ def open_liveness(
     if not detects:
         raise PackError(
             f"{folder} has a liveness graph and no detector; liveness is seen on the whole frame:"
-            " add a SCRFD or YuNet .onnx file."
+            " add a SCRFD or YuNet .onnx file, or remove the liveness graph."
         )
-    return PassiveLiveness(
-        [
-            LivenessGraph(
-                graph, stated.liveness_of(graph.file) or LivenessStatement(file=graph.file)
-            )
-            for graph in graphs
-        ]
-    )
+    try:
+        return PassiveLiveness(
+            [
+                LivenessGraph(
+                    graph, stated.liveness_of(graph.file) or LivenessStatement(file=graph.file)
+                )
+                for graph in graphs
+            ]
+        )
+    except PackError as error:
+        raise PackError(f"{error} Or remove the file.") from error
 
 
 def crop_face(

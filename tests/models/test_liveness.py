@@ -187,7 +187,7 @@ def test_the_scale_in_the_name_that_the_authors_give(tmp_path, name, scale):
 @pytest.mark.parametrize(
     ("toml", "graphs", "said"),
     [
-        ("", {"net": NET}, r"net\.onnx.*crop_scale in pack\.toml"),
+        ("", {"net": NET}, r"net\.onnx.*crop_scale in pack\.toml.*Or remove the file\."),
         (stated(file='"gone.onnx"'), {NAMED: NET}, r"gone\.onnx"),
         (stated(file=f'"{NAMED}.onnx"', live_class=3), {NAMED: NET}, "3 classes.*live_class 3"),
         (stated(file='"open.onnx"', crop_scale=2), {"open": OPEN}, "takes any x any pixels"),
