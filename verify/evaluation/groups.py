@@ -54,9 +54,9 @@ def by_group(
     Returns the groups' ``fmr`` and ``fnmr``, ages in the order of years, and a summary. ``judged``
     says whether a rate has trials enough to be compared: for the FMR :func:`fmr_judged`, for the
     FNMR ``MIN_GENUINE``. The summary has the rates of all trials within a group (``pooled``); the
-    ``worst`` judged group, ``apart`` where its interval (at 1 − 0.05 / groups) is above the pooled
-    rate; and the worst rate over the geometric mean of the judged ones, the ``ratio`` of ISO/IEC
-    19795-10 and of NIST's FRVT (IR 8429).
+    number of others (``without_common_label``); the ``worst`` judged group, ``apart`` where its
+    interval (at 1 − 0.05 / groups) is above the pooled rate; and the worst rate over the geometric
+    mean of the judged ones, the ``ratio`` of ISO/IEC 19795-10 and of NIST's FRVT (IR 8429).
     """
     wrong = sum(
         ((run >= limit) != same).astype(np.int64)
@@ -84,7 +84,7 @@ def by_group(
         fmr["judged"] = fmr_judged(fmr["trials"], target_fmr)
         fnmr["judged"] = fnmr["trials"] >= MIN_GENUINE
         groups.append({**head, "group": name, "fmr": fmr, "fnmr": fnmr})
-    summary = dict(head)
+    summary = head | {"without_common_label": int(np.count_nonzero(~together))}
     for kind, trials in (("fmr", ~same), ("fnmr", same)):
         pooled = summary[f"pooled_{kind}"] = counted(trials & together)
         judged = [(group["group"], group[kind]) for group in groups if group[kind]["judged"]]

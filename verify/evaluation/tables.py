@@ -231,7 +231,9 @@ def _group_tables(groups: Sequence[Row], summaries: Sequence[Row]) -> list[str]:
             ),
         ]
         title = f"**{plain(attribute)}, threshold at FMR {power(target)}**"
+        outside = count(lines[0]["without_common_label"])
         parts += [title, _table(*_cells(columns, lines))]
+        parts.append(f"Pairs without a common label, which are in no group: {outside}.")
     return parts
 
 

@@ -54,6 +54,7 @@ def test_every_trial_is_counted_once():
     assert found == {"Female": ((15, 300), (10, 200)), "Male": ((3, 1200), (4, 400))}
     assert counts(summary["pooled_fmr"]) == (18, 1500)
     assert counts(summary["pooled_fnmr"]) == (14, 600)
+    assert summary["without_common_label"] == 3 + 6 + 602 + 401 + 8
     json.dumps([groups, summary], allow_nan=False)
 
 

@@ -156,6 +156,7 @@ def test_the_worst_group_is_named_with_its_counts() -> None:
     head = {name: row[name] for name in names} | {"seed": 0}
     results["groups"] = [head | entry for entry in groups]
     results["group_summaries"] = [head | summary]
+    assert "without a common label, which are in no group: 0." in markdown(results)
     (line,) = table_of(markdown(results), place=1)
     assert (line["strategy"], line["matching"]) == ("hybrid (generator)", "s-to-s")
     for title, start, counts in (
