@@ -29,14 +29,15 @@ def available_providers() -> dict[str, str]:
 def resolve_providers(names: Sequence[str]) -> list[str]:
     """Full names of the providers that are asked for, by full or short ones, in their order."""
     available = available_providers()
-    resolved = [available.get(name.removesuffix(_SUFFIX).lower()) for name in names]
-    if not names or None in resolved:
+    short = [name.removesuffix(_SUFFIX).lower() for name in names]
+    missing = [name for name in short if name not in available]
+    if missing or not names:
         raise ProviderUnavailable(
-            f"Of the execution providers {', '.join(names) or '(none)'} not all are available;"
+            f"Not available as an execution provider: {', '.join(missing) or '(none named)'};"
             f" available are: {', '.join(available)}. Install the onnxruntime build for that"
             " accelerator, or request one of these."
         )
-    return [name for name in resolved if name is not None]
+    return [available[name] for name in short]
 
 
 @dataclass(frozen=True)

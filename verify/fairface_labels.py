@@ -50,8 +50,8 @@ def read_labels(file: Path) -> dict[Path, dict[str, str]]:
     text = decoded(read_whole(file, most=_MAX_BYTES), file=file)
     labels = {}
     for where, row in csv_rows(file, text, required=("file", *CLASSES)):
-        if not row["file"].isprintable():
-            raise DatasetError(f"{where}: the name of the file is not printable")
+        if not row["file"] or not row["file"].isprintable():
+            raise DatasetError(f"{where}: the name of the file is empty or not printable")
         row["age"] = repaired_age(row["age"]) or row["age"]
         for name, known in CLASSES.items():
             if row[name] not in known:

@@ -44,7 +44,11 @@ def test_labels_are_found_by_the_path_of_the_photo(tmp_path):
         ("train/1.jpg,3-9,Female,Martian,FALSE", "line 2: the race is none of"),
         ("train/1.jpg,3-9,,Black,FALSE", "line 2: the gender is none of"),
         ("train/1.jpg", "line 2 has 1 cells, not 5"),
-        ("train/\0.jpg,3-9,Female,Black,FALSE", "line 2: the name of the file is not printable"),
+        (
+            "train/\0.jpg,3-9,Female,Black,FALSE",
+            "line 2: the name of the file is empty or not printable",
+        ),
+        (",3-9,Female,Black,FALSE", "line 2: the name of the file is empty"),
         ("train/\u202e.jpg,3-9,Female,Black,FALSE", "line 2: the name of the file"),
     ],
 )

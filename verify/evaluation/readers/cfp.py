@@ -112,7 +112,7 @@ def _pair(where: str, line: str, photos: Sequence[Sequence[str]]) -> list[str]:
 
 
 READER = Reader(
-    "a CFP folder (Protocol/ and Data/)",
+    "a CFP folder (Protocol/ and Data/: name the folder that holds `Protocol/`)",
     lambda path: (path / LIST.format("F")).is_file(),
     read_cfp,
 )
