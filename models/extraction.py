@@ -21,7 +21,7 @@ from models.sessions import default_workers
 CHUNK = 128
 """Photos embedded together. Their crops are in memory at once, photos only one per thread."""
 _KEPT_SECONDS = 60.0
-"""Between two writes of the cache: what a killed run loses."""
+"""Between two writes of the cache, which a killed run loses; of large caches more."""
 
 Advance = Callable[[int], None]
 
@@ -113,7 +113,7 @@ class Extractor:
         """Embed photos."""
         given = [one if isinstance(one, Photo) else Photo(str(one), one) for one in photos]
         files: list[_File] = []
-        kept_at = time.monotonic()
+        write_at = time.monotonic() + _KEPT_SECONDS
         try:
             with ThreadPoolExecutor(default_workers()) as pool:
                 for start in range(0, len(given), CHUNK):
@@ -122,9 +122,10 @@ class Extractor:
                     files += chunk
                     if progress is not None:
                         progress(len(chunk))
-                    if time.monotonic() > kept_at + _KEPT_SECONDS:
+                    if (now := time.monotonic()) > write_at:
                         self._cache.flush()
-                        kept_at = time.monotonic()
+                        written = time.monotonic()
+                        write_at = written + max(_KEPT_SECONDS, 20 * (written - now))
         finally:
             self._cache.flush()
         rows = [file.embedding for file in files if file.embedding is not None]
