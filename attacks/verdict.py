@@ -97,8 +97,9 @@ LIMITS: tuple[Limit, ...] = (
     Limit(
         WITH_KEY,
         1.0,
-        "what no template withstands where every key leaked: it holds vectors that it accepts, as "
-        "does a renewed one of the same face, and several of one person meet in the person",
+        "Attacks that succeed by design once every key has leaked. A template accepts the vectors "
+        "inside it; a renewed template holds the same face; several templates of one person "
+        "intersect in that person's embedding.",
     ),
     Limit(
         WITHOUT_KEY,

@@ -24,7 +24,7 @@ class Face:
     keypoints: NDArray[np.float32]  # (5, 2)
 
     def moved(self, offset: NDArray[np.float32], scale: NDArray[np.float32]) -> "Face":
-        """The face in a picture that begins at ``offset`` of this one, and is ``scale`` finer."""
+        """The same face in a crop from ``offset`` on, whose pixels are ``scale`` times as large."""
         corners = (self.box.reshape(2, 2) - offset) / scale
         return Face(corners.reshape(4), self.score, (self.keypoints - offset) / scale)
 

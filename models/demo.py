@@ -58,10 +58,10 @@ def build_demo_pack(folder: Path) -> Path:
 @cache
 def demo_model_bytes() -> bytes:
     """Build the ONNX file: the same bytes each time, since its SHA-256 stands in contracts."""
-    return _model_less(_mean_projection())
+    return _model_without(_mean_projection())
 
 
-def _model_less(mean: NDArray[np.float32]) -> bytes:
+def _model_without(mean: NDArray[np.float32]) -> bytes:
     cell, step, around = [_CELL] * 2, [_STRIDE] * 2, [3, 3]
     nodes = [
         _node("Conv", ["image", "edges"], "slopes", pads=[_REACH] * 4),
@@ -130,7 +130,7 @@ def _projections(crops: NDArray[np.uint8]) -> NDArray[np.float64]:
 def _session() -> ort.InferenceSession:
     options = ort.SessionOptions()
     options.intra_op_num_threads = 1  # the order of a sum must not depend on the number of cores
-    model = _model_less(np.zeros(DEMO_DIMENSION, np.float32))
+    model = _model_without(np.zeros(DEMO_DIMENSION, np.float32))
     return ort.InferenceSession(model, options, providers=["CPUExecutionProvider"])
 
 

@@ -67,8 +67,8 @@ class Impostors:
 
     def weighted_trials(self, weights: Array64) -> float:
         """Weight of all trials under bootstrap weights of the people, (people,)."""
-        probes, meets, own = self._by_group
-        return float((probes @ weights) @ (meets @ weights) - own @ weights**2)
+        probes, meets, own_cells = self._by_group
+        return float((probes @ weights) @ (meets @ weights) - own_cells @ weights**2)
 
     @cached_property
     def person_pairs(self) -> int:
