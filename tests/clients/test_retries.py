@@ -131,6 +131,11 @@ def test_what_is_sent_again(step: Step, write_again: bool, verification_again: b
             assert error.sent
 
 
+def test_readiness_is_asked_once() -> None:
+    sendings, waits, error = driven(PhotoCalls.ready, [STORE], {"status": "ok"}, Retries())
+    assert (sendings, waits, type(error).__name__) == (1, [], "Unavailable")
+
+
 def test_sendings_are_bounded_and_waits_grow_with_jitter() -> None:
     patient = Retries(sendings=7, patience_s=2.0)
     sendings, waits, error = driven(enroll, [GATEWAY] * 9, ENROLLED, patient)

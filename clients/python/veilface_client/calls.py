@@ -167,8 +167,9 @@ class Calls:
         return await self._send(results.TokenOutcome, "GET", path)
 
     async def ready(self) -> results.Health:
-        """Ask whether the service can answer; otherwise :class:`Unavailable`."""
-        return await self._send(results.Health, "GET", "/health/ready")
+        """Ask once whether the service can answer; otherwise :class:`Unavailable`."""
+        once = Retries(sendings=1)
+        return await self._send(results.Health, "GET", "/health/ready", retries=once)
 
     async def _enroll(
         self, subject: str, replace: bool | str, **content: Any
@@ -200,6 +201,7 @@ class Calls:
         path: str,
         *,
         repeatable: bool = True,
+        retries: Retries | None = None,
         **content: Any,
     ) -> V:
         """Send a request until it is answered, or the retries say that it is enough."""
@@ -213,7 +215,7 @@ class Calls:
                 if response.is_success:
                     return result.read(response)
                 failure = error_of(response)
-            wait = self._retries.wait(failure, sending=sending, repeatable=repeatable)
+            wait = (retries or self._retries).wait(failure, sending=sending, repeatable=repeatable)
             if wait is None:
                 # Without its cause: the texts of a protocol error may repeat a header.
                 raise failure from None
