@@ -4,16 +4,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from api.http.errors import StartError
+from api.http.errors import ApiError, StartError
 from api.settings import Settings
 from models.pack import ModelPack
 
 
-@dataclass(frozen=True)
+@dataclass
 class ServedGraph:
     """One graph: SHA-256 (hexadecimal) of its file, its input in pixels.
 
-    Of a detector, `kind` says how its output is read.
+    Of a detector, `kind` says how its output is read. `size` (bytes) and `modified_ns` are those of
+    the file at the start of the service.
     """
 
     role: Literal["detector", "embedder"]
@@ -21,6 +22,26 @@ class ServedGraph:
     sha256: str
     input_size: tuple[int, int]
     path: Path = field(repr=False)
+    size: int = field(init=False)
+    modified_ns: int = field(init=False)
+
+    def __post_init__(self) -> None:
+        stat = self.path.stat()
+        self.size, self.modified_ns = stat.st_size, stat.st_mtime_ns
+
+    def require_unchanged(self) -> None:
+        """Refuse to give a file that is another one than at the start."""
+        try:
+            now = self.path.stat()
+        except OSError:
+            now = None
+        if now is None or (now.st_size, now.st_mtime_ns) != (self.size, self.modified_ns):
+            raise ApiError(
+                "model_unavailable",
+                "the pack's files were changed since the service started: it must start again",
+                {},
+                {"Retry-After": "60"},
+            )
 
 
 def served_graphs(settings: Settings, pack: ModelPack | None) -> dict[str, ServedGraph]:

@@ -46,6 +46,8 @@ async def list_pack(call: AnyCall) -> PackAnswer:
     pack, graphs = call.runtime.pack, call.runtime.graphs
     if pack is None or not graphs:
         raise _not_served()
+    for graph in graphs.values():
+        graph.require_unchanged()
     known = KNOWN_PACKS.get(pack.info.name.lower())
     return PackAnswer(
         name=pack.info.name,
@@ -57,7 +59,7 @@ async def list_pack(call: AnyCall) -> PackAnswer:
                 kind=graph.kind,
                 file=graph.path.name,
                 sha256=graph.sha256,
-                bytes=graph.path.stat().st_size,
+                bytes=graph.size,
                 path=f"{call.request.scope['root_path']}{router.prefix}/{graph.sha256}",
                 input_size=list(graph.input_size),
             )
@@ -97,6 +99,7 @@ async def get_pack_file(
     headers = {"ETag": f'"{graph.sha256}"', "Cache-Control": KEPT}
     if has_copy(call.request, headers["ETag"]):
         return Response(status_code=304, headers=headers)
+    graph.require_unchanged()
     headers["Accept-Ranges"] = "none"
     return _WholeFile(graph.path, media_type="application/octet-stream", headers=headers)
 

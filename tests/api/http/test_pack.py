@@ -109,6 +109,21 @@ def test_it_is_off_by_default(client: Client) -> None:
         assert_error(client.get(path, headers=with_token(client)), 404, "not_found")
 
 
+def test_a_file_that_was_changed_is_not_given_under_the_old_hash(tmp_path: Path) -> None:
+    deployment = deploy(tmp_path, serve_pack=True)
+    with Client(create_app(deployment.settings)) as client:
+        client.headers.update(bearer(deployment.token))
+        client.headers.update(with_token(client))
+        (entry,) = client.get("/v1/pack").json()["files"]
+        file = folder_of(deployment) / entry["file"]
+        file.write_bytes(file.read_bytes() + b"x")
+        for path in (entry["path"], "/v1/pack"):
+            assert_error(client.get(path), 503, "model_unavailable")
+        file.unlink()
+        for path in (entry["path"], "/v1/pack"):
+            assert_error(client.get(path), 503, "model_unavailable")
+
+
 def test_a_service_without_a_pack_has_none_to_serve(deployment: Deployment) -> None:
     settings = deployment.settings.model_copy(update={"serve_pack": True, "pack": None})
     with pytest.raises(StartError, match="serve_pack: there is no pack"):
