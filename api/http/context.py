@@ -13,7 +13,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from api.http.audit import note_refusal
 from api.http.errors import ERROR_CODES, ApiError, api_error, error_answer
-from api.http.schemas import REQUEST_ID
+from api.http.schemas import NOTICE, REQUEST_ID
 from api.limits.rates import RateLimits
 from api.service.logging import log
 from api.service.metrics import ERRORS, IN_FLIGHT, LOCKED_OUT, count_request
@@ -45,6 +45,7 @@ class RequestContext:
     ) -> None:
         self._app = app
         self._root_path = root_path
+        self._notice = DEMO_NOTICE if demo else None
         self._headers = dict(SECURITY_HEADERS)
         if tls:
             self._headers["Strict-Transport-Security"] = HSTS
@@ -60,6 +61,7 @@ class RequestContext:
         if not SANE_REQUEST_ID.fullmatch(request_id):
             request_id = secrets.token_hex(16)
         REQUEST_ID.set(request_id)
+        NOTICE.set(self._notice)
         fields: dict[str, Any] = {}
         scope.setdefault("state", {})["log"] = fields
         scope["root_path"] = self._root_path

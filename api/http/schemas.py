@@ -13,6 +13,8 @@ from verify.challenge import LivenessFailure
 
 REQUEST_ID: ContextVar[str] = ContextVar("request_id")
 """Id of the request that is being answered, which the middleware sets."""
+NOTICE: ContextVar[str | None] = ContextVar("notice", default=None)
+"""What every answer of the demo says, which the middleware sets too."""
 
 
 def iso_time(value: datetime) -> str:
@@ -42,6 +44,11 @@ class _Answer(_Shape):
 
     request_id: str = Field(
         default_factory=lambda: REQUEST_ID.get(), description="Also in X-Request-ID."
+    )
+    notice: str | None = Field(
+        default_factory=lambda: NOTICE.get(),
+        description="Only with the demo model.",
+        exclude_if=lambda value: value is None,
     )
 
 

@@ -80,3 +80,4 @@ def test_the_demo_says_so_in_every_answer(tmp_path: Path) -> None:
     with Client(create_app(deployment.settings), headers=bearer(deployment.token)) as client:
         for path in ("/health/live", "/v1/contract", "/v1/contract/generator", "/nowhere"):
             assert client.get(path).headers["x-veilface-notice"] == notice
+        assert client.get("/v1/contract").json()["notice"] == notice
