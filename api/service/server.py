@@ -16,7 +16,7 @@ from typing import Any
 import uvicorn
 from fastapi import FastAPI
 from uvicorn.config import STARTUP_FAILURE
-from uvicorn.supervisors import Multiprocess
+from uvicorn.supervisors import Multiprocess, multiprocess
 
 from api.http.app import create_app
 from api.http.errors import StartError
@@ -71,6 +71,23 @@ class _Workers(Multiprocess):
         for listener in self.sockets:
             listener.close()
         super().terminate_all()
+
+
+class _Worker(multiprocess.Process):
+    """uvicorn's worker, which alone holds its end of the pipe that asks for a sign of life.
+
+    The first process would otherwise wait for a dead worker's answer for all of the time that a
+    living one has, deaf to other deaths and to the signal to stop.
+    """
+
+    def start(self) -> None:
+        """Start the process, and let go of its end."""
+        super().start()
+        self.child_conn.close()
+
+
+# What uvicorn's supervisor calls for a worker.
+multiprocess.Process = _Worker  # type: ignore[misc]
 
 
 def _worker_app(settings: Settings, contract: Contract) -> FastAPI:

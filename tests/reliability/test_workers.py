@@ -2,6 +2,8 @@
 
 import os
 import signal
+import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -36,6 +38,31 @@ def test_a_worker_that_is_killed_is_replaced_while_the_others_answer(tmp_path: P
         assert clients.verify("a", 1).accepted
         wait_until(lambda: len(service.workers()) == 2)
         assert second in service.workers()
+        assert service.stop() == 0
+
+
+IMPATIENT = f"""
+import sys
+from api.cli import main
+from api.service import server
+server.SIGN_OF_LIFE_S = {2 * PATIENCE_S}
+sys.argv = sys.argv[3:]
+main()
+"""
+"""``veilface serve`` that waits longer for a worker's sign of life than this test for its end."""
+
+
+def test_a_worker_that_is_killed_while_it_starts_does_not_delay_the_end(tmp_path: Path) -> None:
+    deployment = deploy(tmp_path, port=free_port(), **QUIET)
+    with Server(deployment, tmp_path, within=[sys.executable, "-c", IMPATIENT]) as service:
+        before = children(service)
+        os.kill(service.workers()[0], signal.SIGKILL)
+        wait_until(lambda: children(service) - before)
+        (starting,) = children(service) - before
+        os.kill(starting, signal.SIGSTOP)
+        # Now the first process asks it for a sign of life.
+        time.sleep(2)
+        os.kill(starting, signal.SIGKILL)
         assert service.stop() == 0
 
 
