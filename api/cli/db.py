@@ -109,7 +109,7 @@ def purge(
     """
     retention = retention_of(settings)
     with checked_store(settings) as store:
-        due, erased, log_purged = store.erasures.expired(retention), 0, True
+        due, erased, log_purged = store.erasures.count_due(retention), 0, True
         if not dry_run:
             erased = store.erasures.erase_expired(retention)
             log_purged = store.purge()

@@ -54,7 +54,7 @@ class RecordProblem:
 class Verification:
     """What a walk over the whole chain showed: good lines, the last of them, the first break.
 
-    Where there is none, `records` are the rows that contradict the log.
+    If the chain is whole, `records` are the rows that contradict the log.
     """
 
     lines: int
@@ -190,7 +190,11 @@ def _enrollments(
 def _counts(
     findings: LogFindings, store: TemplateStore, session: Session
 ) -> Iterator[RecordProblem]:
-    stored = {row.pseudonym: row for row in session.scalars(sa.select(FailedAttemptsRow))}
+    try:
+        stored = {row.pseudonym: row for row in session.scalars(sa.select(FailedAttemptsRow))}
+    except StoreError:
+        yield RecordProblem(COUNT_LIFTED, "a row that cannot be read")
+        return
     for pseudonym, failures in findings.failures.items():
         row = stored.get(pseudonym)
         # The row counts what the log tells, and its last failure is the log's.

@@ -7,6 +7,8 @@ from typing import Any
 import sqlalchemy as sa
 from sqlalchemy.orm import Session
 
+from templates.errors import StoreError, StoreUnavailable
+from templates.store.audit_chain import BrokenAuditLog
 from templates.store.audit_log import PROGRAM, TENANT_ERASE, By, Entry
 from templates.store.context import StoreContext
 from templates.store.database import delete
@@ -20,7 +22,7 @@ from templates.store.receipts import (
     tenant_receipt_name,
 )
 from templates.store.retention import Retention
-from templates.store.schema import Base, FailedAttemptsRow, SubjectRow, TenantRow
+from templates.store.schema import IDS, Base, FailedAttemptsRow, SubjectRow, TenantRow
 from templates.store.subjects import subject_of
 from templates.store.tenants import tenant_of
 
@@ -69,15 +71,28 @@ class Erasures:
 
         Each like any other subject, with a receipt and a line in the audit log, in a transaction of
         its own. It may be interrupted, run again, and run by several workers at once. `batch`
-        subjects are listed at once.
+        subjects are listed at once. :class:`StoreError` at the end, if rows of tenants or subjects
+        were altered so that they cannot be erased; all others are erased.
         """
-        erased, due = 0, retention.expired(self._context.clock())
-        while rows := self._listed(due, batch):
+        erased, broken, after = 0, 0, ""
+        due = retention.is_due(self._context.clock())
+        while rows := self._listed(due & (SubjectRow.id > after), batch):
             for row in rows:
+                after = row.id
                 # The row, too: a subject of the same name may have been enrolled anew.
                 is_due = sa.and_(SubjectRow.id == row.id, due)
-                erased += self.erase_if(row.name, row.subject_id, is_due, by=by)
+                try:
+                    erased += self.erase_if(row.name, row.subject_id, is_due, by=by)
+                except (StoreUnavailable, BrokenAuditLog):
+                    raise
+                except (StoreError, TypeError):
+                    broken += 1
             self._context.database.purge_log()
+        if broken:
+            raise StoreError(
+                f"{broken} subjects whose retention has ended could not be erased, because rows "
+                f"were altered; {erased} were erased. Run `veilface audit-log verify`"
+            )
         return erased
 
     def erase_if(
@@ -95,11 +110,11 @@ class Erasures:
     def _listed(self, due: sa.ColumnElement[bool], batch: int) -> Sequence[Any]:
         query = sa.select(SubjectRow.id, TenantRow.name, SubjectRow.subject_id).join(TenantRow)
         with self._context.database.read() as session:
-            return session.execute(query.where(due).limit(batch)).all()
+            return session.execute(query.where(due).order_by(SubjectRow.id).limit(batch)).all()
 
-    def expired(self, retention: Retention) -> int:
+    def count_due(self, retention: Retention) -> int:
         """Count the subjects that :meth:`erase_expired` would erase now."""
-        due = retention.expired(self._context.clock())
+        due = retention.is_due(self._context.clock())
         with self._context.database.read() as session:
             return session.execute(sa.select(sa.func.count(SubjectRow.id)).where(due)).scalar_one()
 
@@ -130,7 +145,7 @@ class Erasures:
     ) -> tuple[Receipt, bool]:
         pseudonym = self._context.signer.pseudonym(tenant, subject_id)
         tenant_id = tenant_of(session, tenant).id
-        subject = subject_of(session, tenant, subject_id)
+        subject = subject_of(session, tenant, subject_id, IDS)
         failed_attempts = delete(
             session,
             FailedAttemptsRow,
@@ -147,7 +162,7 @@ class Erasures:
                 tenant=tenant,
                 subject=pseudonym,
                 held=subject is not None,
-                contract_id=subject and subject.contract_id,
+                contract_id=subject and str(subject.contract_id),
                 # Template, data key and metadata are columns of the subject's row.
                 erased={
                     **dict.fromkeys(("template", "data_key", "metadata"), subjects),

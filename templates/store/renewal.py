@@ -45,10 +45,11 @@ def renew_secrets(store: TemplateStore, archive: Path, *, by: By = PROGRAM) -> R
     old_receipt_key = store.secrets.get(SecretName.RECEIPT)
 
     with store.database.write() as session:
-        archived = write_archive(session, store, archive, None)
         fresh = {name: store.secrets.draw(session, name) for name in SecretName if name not in KEPT}
         refused = store.api_keys.authenticate_again(session, fresh[SecretName.API_KEYS])
         receipts = sign_again(session, old_receipt_key, fresh[SecretName.RECEIPT])
+        # After all that may refuse: an archive that is left would stop the next try.
+        archived = write_archive(session, store, archive, None)
         key = fresh[SecretName.CHAIN]
         begin_chain(session, key, archived.last)
         store.audit_log.append(session, Entry("secrets-renew", "renewed", by), key=key)

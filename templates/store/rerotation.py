@@ -19,7 +19,7 @@ import functools
 from collections.abc import Callable, Sequence
 
 import sqlalchemy as sa
-from sqlalchemy.orm import Session
+from sqlalchemy.orm import Session, load_only
 
 from templates.contract import wire
 from templates.contract.binding import Binding
@@ -29,10 +29,21 @@ from templates.store.audit_log import PROGRAM, By, Entry
 from templates.store.context import StoreContext
 from templates.store.database import delete
 from templates.store.envelope import open_template, seal_template
-from templates.store.schema import SEALED, RotationKeyRow, SubjectRow, TenantRow
+from templates.store.schema import RotationKeyRow, SubjectRow, TenantRow
 from templates.store.tenants import RetiredRotation, Tenants, tenant_of
 
 ACTION = "tenant-rotate"
+# A row of which another column cannot be read is moved all the same.
+OPENED = load_only(
+    SubjectRow.tenant_id,
+    SubjectRow.subject_id,
+    SubjectRow.contract_id,
+    SubjectRow.template_id,
+    SubjectRow.rotation_epoch,
+    SubjectRow.holder_salt,
+    SubjectRow.wrapped_key,
+    SubjectRow.ciphertext,
+)
 BATCH = 10
 
 
@@ -149,7 +160,7 @@ class Rerotation:
             owner = tenant_of(session, tenant)
             query = (
                 sa.select(SubjectRow)
-                .options(SEALED)
+                .options(OPENED)
                 .where(_is_older(owner), SubjectRow.contract_id == binding.contract_id)
                 .where(SubjectRow.id > after)
                 .order_by(SubjectRow.id)

@@ -19,7 +19,7 @@ class Retention:
     max_age: timedelta | None = None
     max_disuse: timedelta | None = None
 
-    def expired(self, now: datetime) -> sa.ColumnElement[bool]:
+    def is_due(self, now: datetime) -> sa.ColumnElement[bool]:
         """Condition on a row of ``subjects``: it is due at this time."""
         reasons: list[sa.ColumnElement[bool]] = [sa.false()]
         if self.max_age is not None:

@@ -10,13 +10,13 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import sqlalchemy as sa
-from sqlalchemy.orm import undefer
+from sqlalchemy.orm import load_only
 
 from templates.errors import SealError
 from templates.keys.sealing import KEY_ID_BYTES
 from templates.store.context import StoreContext
 from templates.store.envelope import DATA_KEY_PURPOSE
-from templates.store.schema import RotationKeyRow, SecretRow, SubjectRow
+from templates.store.schema import Blob, RotationKeyRow, SecretRow, SubjectRow
 from templates.store.secrets import SECRET_PURPOSE
 from templates.store.tenants import ROTATION_PURPOSE
 
@@ -40,7 +40,7 @@ WRAPPED = (
 def rewrap_keys(
     context: StoreContext, *, batch: int = 200, progress: Callable[[int], None] | None = None
 ) -> int:
-    """Bring every wrapped blob under the keyring's current key; returns how many were not.
+    """Bring every wrapped blob under the keyring's current key; returns how many it wrapped again.
 
     `progress` is called after each transaction, of `batch` rows, with the number it wrapped.
 
@@ -71,13 +71,16 @@ def rewrap_keys(
 
 
 def count_wrapped(context: StoreContext) -> dict[str, int]:
-    """Count the blobs under each master key id; one that is absent wraps nothing any more."""
+    """Count the blobs under each master key id; one that is absent wraps nothing any more.
+
+    What is no sealed blob is counted as ``unreadable``.
+    """
     counts: Counter[str] = Counter()
     with context.database.read() as session:
         for wrapped in WRAPPED:
             query = sa.select(_key_id(wrapped).label("master_key"), sa.func.count())
             for key_id, count in session.execute(query.group_by("master_key")):
-                counts[key_id.hex()] += count
+                counts[key_id.hex() or "unreadable"] += count
     return counts
 
 
@@ -90,7 +93,9 @@ def _rewrap(
     with context.database.write() as session:
         query = (
             sa.select(table)
-            .options(undefer(table.wrapped_key))
+            .options(
+                load_only(*(getattr(table, name) for name in (*wrapped.bound_to, "wrapped_key")))
+            )
             .where(_key_id(wrapped) != bytes.fromhex(keyring.current))
             .order_by(*key)
             .limit(batch)
@@ -113,4 +118,4 @@ def _rewrap(
 
 def _key_id(wrapped: Wrapped) -> Any:
     """The id of the master key, which follows a blob's version (``templates.keys.sealing``)."""
-    return sa.func.substr(wrapped.table.wrapped_key, 2, KEY_ID_BYTES, type_=sa.LargeBinary)
+    return sa.func.substr(wrapped.table.wrapped_key, 2, KEY_ID_BYTES, type_=Blob)

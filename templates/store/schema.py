@@ -26,6 +26,8 @@ from sqlalchemy import (
 )
 from sqlalchemy.orm import DeclarativeBase, Load, Mapped, mapped_column
 
+from templates.errors import StoreError
+
 PSEUDONYM = String(64)
 UUID_HEX = String(32)
 
@@ -35,7 +37,6 @@ SERIAL = BigInteger().with_variant(Integer, "sqlite")
 
 RowId = Annotated[str, mapped_column(UUID_HEX, primary_key=True)]
 TenantId = Annotated[str, mapped_column(UUID_HEX, ForeignKey("tenants.id", ondelete="CASCADE"))]
-Mac = Annotated[bytes, mapped_column(LargeBinary(32))]
 Sealed = Annotated[
     bytes, mapped_column(deferred=True, deferred_group="sealed", deferred_raiseload=True)
 ]
@@ -48,7 +49,57 @@ class Source(StrEnum):
     TEMPLATE = "template"
 
 
-class UtcDateTime(TypeDecorator[datetime]):
+class Checked(TypeDecorator[Any]):
+    """A type of which no error quotes a cell; SQLite keeps any value in any column."""
+
+    def result_processor(self, dialect: Dialect, coltype: object) -> Any:
+        """Read a cell, or raise a StoreError."""
+        read = super().result_processor(dialect, coltype)
+
+        def checked(value: Any) -> Any:
+            try:
+                return read(value)  # type: ignore[misc]
+            except (LookupError, ValueError, TypeError):
+                raise StoreError(
+                    "a row of the database was altered and cannot be read: run `veilface audit-log "
+                    "verify`; erase a subject whose row it is, and enroll it again"
+                ) from None
+
+        return checked
+
+
+class Kind(Checked):
+    """An enumeration, as text."""
+
+    impl = Enum
+    cache_ok = True
+
+
+class Whole(Checked):
+    """A whole number."""
+
+    impl = Integer
+    cache_ok = True
+
+    def process_result_value(self, value: Any, dialect: Dialect) -> int | None:  # noqa: ARG002
+        """Refuse a text or a fraction."""
+        if not isinstance(value, int | None):
+            raise TypeError
+        return value
+
+
+class Blob(TypeDecorator[bytes]):
+    """Bytes; anything else is read as none, which no MAC and no seal fits."""
+
+    impl = LargeBinary
+    cache_ok = True
+
+    def result_processor(self, dialect: Dialect, coltype: object) -> Any:  # noqa: ARG002
+        """Read a cell."""
+        return lambda value: value if isinstance(value, bytes | None) else b""
+
+
+class UtcDateTime(Checked):
     """An aware time, in UTC on both sides; SQLite would otherwise hand back a naive one."""
 
     impl = DateTime(timezone=True)
@@ -72,7 +123,11 @@ class UtcDateTime(TypeDecorator[datetime]):
 class Base(DeclarativeBase):
     """Base of the mapped tables; constraint names are fixed so that migrations can name them."""
 
-    type_annotation_map: ClassVar[dict[Any, Any]] = {datetime: UtcDateTime}
+    type_annotation_map: ClassVar[dict[Any, Any]] = {
+        bytes: Blob,
+        datetime: UtcDateTime,
+        int: Whole,
+    }
     metadata = MetaData(
         naming_convention={
             "ix": "ix_%(table_name)s_%(column_0_N_name)s",
@@ -112,14 +167,14 @@ class ApiKeyRow(Base):
     id: Mapped[RowId]
     tenant_id: Mapped[TenantId] = mapped_column(index=True)
     prefix: Mapped[str] = mapped_column(String(16), unique=True)
-    token_hash: Mapped[bytes] = mapped_column(LargeBinary(32))
+    token_hash: Mapped[bytes]
     rights: Mapped[str] = mapped_column(String(128))
     label: Mapped[str] = mapped_column(String(128))
     created_at: Mapped[datetime]
     expires_at: Mapped[datetime | None]
     revoked_at: Mapped[datetime | None]
     lowest_level: Mapped[str | None] = mapped_column(String(64))
-    mac: Mapped[Mac]
+    mac: Mapped[bytes]
 
 
 class SubjectRow(Base):
@@ -141,7 +196,7 @@ class SubjectRow(Base):
     template_id: Mapped[str] = mapped_column(String(64))
     contract_id: Mapped[str] = mapped_column(String(64))
     rotation_epoch: Mapped[int]
-    source: Mapped[Source] = mapped_column(Enum(Source, native_enum=False, length=16))
+    source: Mapped[Source] = mapped_column(Kind(Source, native_enum=False, length=16))
     photos: Mapped[int]
     holder_salt: Mapped[str | None] = mapped_column(UUID_HEX)
     created_at: Mapped[datetime]
@@ -152,6 +207,10 @@ class SubjectRow(Base):
 
 
 SEALED = Load(SubjectRow).undefer_group("sealed")
+# These columns are readable whatever was altered.
+IDS = Load(SubjectRow).load_only(
+    SubjectRow.tenant_id, SubjectRow.subject_id, SubjectRow.template_id, SubjectRow.contract_id
+)
 
 
 class FailedAttemptsRow(Base):
@@ -174,7 +233,7 @@ class ReceiptRow(Base):
     sequence: Mapped[int] = mapped_column(SERIAL, primary_key=True, autoincrement=True)
     pseudonym: Mapped[str] = mapped_column(PSEUDONYM)
     body: Mapped[str] = mapped_column(Text)
-    signature: Mapped[bytes] = mapped_column(LargeBinary(64))
+    signature: Mapped[bytes]
 
 
 class AuditRow(Base):
@@ -200,7 +259,7 @@ class AuditRow(Base):
     request_id: Mapped[str | None] = mapped_column(String(64))
     detail: Mapped[str | None] = mapped_column(String(64))
     token: Mapped[str | None] = mapped_column(String(64), unique=True)
-    mac: Mapped[Mac]
+    mac: Mapped[bytes]
 
 
 class AuditHeadRow(Base):
@@ -214,10 +273,10 @@ class AuditHeadRow(Base):
 
     id: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
     base_sequence: Mapped[int] = mapped_column(SERIAL)
-    base_mac: Mapped[Mac]
+    base_mac: Mapped[bytes]
     sequence: Mapped[int] = mapped_column(SERIAL)
-    line_mac: Mapped[Mac]
-    mac: Mapped[Mac]
+    line_mac: Mapped[bytes]
+    mac: Mapped[bytes]
 
 
 class SecretRow(Base):

@@ -20,7 +20,7 @@ from templates.store.identifiers import (
     checked_subject_prefix,
 )
 from templates.store.lockout import Replayed
-from templates.store.schema import SEALED, Source, SubjectRow, TenantRow
+from templates.store.schema import IDS, SEALED, Source, SubjectRow, TenantRow
 from templates.store.tenants import tenant_of
 
 MAX_PAGE = 1000
@@ -131,7 +131,7 @@ class Subjects:
             owner, now = tenant_of(session, tenant), context.clock()
             if rotation_epoch not in (None, owner.rotation_epoch):
                 raise StoreBusy("the tenant's rotation was renewed meanwhile; send it again")
-            subject = subject_of(session, tenant, subject_id)
+            subject = subject_of(session, tenant, subject_id, IDS)
             enrolled = None if subject is None else subject.template_id
             if precondition is not None and enrolled != precondition.template_id:
                 raise EnrollmentConflict(enrolled)

@@ -68,10 +68,10 @@ def test_who_is_due(
     keep = Retention(
         None if max_age is None else max_age * DAY, None if max_disuse is None else max_disuse * DAY
     )
-    assert five.erasures.expired(keep) == 5 - len(kept)
+    assert five.erasures.count_due(keep) == 5 - len(kept)
     assert five.erasures.erase_expired(keep, batch=2) == 5 - len(kept)
     assert names(five) == kept
-    assert five.erasures.expired(keep) == 0
+    assert five.erasures.count_due(keep) == 0
     assert five.erasures.erase_expired(keep) == 0
 
 

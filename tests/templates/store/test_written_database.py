@@ -6,13 +6,23 @@ back, and the service takes it: the verification of the audit log reports it.
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from datetime import timedelta
 from pathlib import Path
 
 import pytest
 import sqlalchemy as sa
 
-from templates.errors import StoreError
-from templates.store import TemplateStore, archive_audit_log, verify_audit_log
+from templates.errors import SealError, StoreError
+from templates.keys.sealing import MasterKeyring
+from templates.store import (
+    Retention,
+    TemplateStore,
+    archive_audit_log,
+    count_wrapped,
+    renew_secrets,
+    rewrap_keys,
+    verify_audit_log,
+)
 from templates.store.audit_verification import (
     COUNT_LIFTED,
     ENROLLMENT_PUT_BACK,
@@ -23,7 +33,7 @@ from templates.store.audit_verification import (
 )
 from tests.databases import execute
 from tests.patience import PATIENCE_S
-from tests.templates.store.conftest import Clock, put
+from tests.templates.store.conftest import CONTRACT, Clock, put
 from tests.templates.store.test_attempts import attempt
 
 
@@ -166,13 +176,90 @@ def test_a_setting_of_a_tenant_that_was_changed_is_reported(store: TemplateStore
 
 
 @pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
-@pytest.mark.parametrize("change", ["expires_at = 'x'", "mac = 'text'", "rights = x'00'"])
+@pytest.mark.parametrize("change", ["expires_at = 'x'", "created_at = 'x'", "rights = x'00'"])
 def test_a_key_row_that_cannot_be_read_is_reported(store: TemplateStore, change: str) -> None:
     made = store.api_keys.create("default", ["verify"])
     write(store, f"UPDATE api_keys SET {change}")
     with pytest.raises(StoreError, match="was altered"):
         store.api_keys.verify(made.token)
     assert reported(store) == [(KEY_ALTERED, "a row that cannot be read")]
+
+
+@pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
+def test_a_key_whose_mac_is_a_text_is_revoked_and_never_vouched_for(
+    store: TemplateStore, tmp_path: Path
+) -> None:
+    made = store.api_keys.create("default", ["verify"])
+    write(store, "UPDATE api_keys SET mac = 'text'")
+    assert store.api_keys.verify(made.token) is None
+    assert store.api_keys.revoke(made.key.prefix)
+    archive = tmp_path / "archive.jsonl"
+    write(store, "UPDATE api_keys SET created_at = 'x'")
+    with pytest.raises(StoreError, match="was altered"):
+        renew_secrets(store, archive)
+    assert not archive.exists()
+    write(store, "UPDATE api_keys SET created_at = '2026-03-01 00:00:00'")
+    assert renew_secrets(store, archive).refused == (made.key.prefix,)
+    assert reported(store) == [(KEY_ALTERED, f"key:{made.key.prefix}")]
+
+
+UNREADABLE = ["source = 'zzz'", "created_at = 'zzz'", "last_used_at = 7", "photos = 'zzz'"]
+
+
+@pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
+@pytest.mark.parametrize("change", [*UNREADABLE, "rotation_epoch = 'zzz'"])
+def test_a_subject_whose_row_cannot_be_read_is_still_replaced_and_erased(
+    store: TemplateStore, clock: Clock, key_file: Path, change: str
+) -> None:
+    damage = f"UPDATE subjects SET {change} WHERE subject_id = 'ada'"
+    for name in ("ada", "eve"):
+        put(store, name, b"wire")
+    write(store, damage)
+    for read in (
+        lambda: store.subjects.list("default"),
+        lambda: store.subjects.describe("default", "ada"),
+        lambda: attempt(store),
+    ):
+        with pytest.raises(StoreError, match="was altered") as caught:
+            read()
+        assert "zzz" not in str(caught.value)
+        assert caught.value.__suppress_context__
+    current = MasterKeyring.add_current(key_file)
+    rewrap_keys(store)
+    assert set(count_wrapped(store)) == {current}
+    assert put(store, "ada", b"other")
+    write(store, damage)
+    assert store.erasures.erase("default", "ada").receipt.claims["contract_id"] == CONTRACT
+    put(store, "ada", b"wire")
+    write(store, damage)
+    clock.pass_by(days=2)
+    assert store.erasures.erase_expired(Retention(timedelta(days=1))) == 2
+
+
+@pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
+def test_a_row_that_cannot_be_erased_stops_no_other(store: TemplateStore, clock: Clock) -> None:
+    for tenant in ("default", "other"):
+        for name in ("ada", "eve"):
+            put(store, name, b"wire", tenant=tenant)
+    write(store, "UPDATE tenants SET rotation_epoch = 'x' WHERE name = 'default'")
+    clock.pass_by(days=2)
+    with pytest.raises(StoreError, match=r"2 subjects .* could not be erased.* 2 were erased"):
+        store.erasures.erase_expired(Retention(timedelta(days=1)), batch=1)
+
+
+@pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
+def test_a_wrapped_key_that_is_a_text_is_counted_and_the_rest_is_wrapped_again(
+    store: TemplateStore, key_file: Path
+) -> None:
+    for name in ("ada", "eve"):
+        put(store, name, b"wire")
+    write(store, "UPDATE subjects SET wrapped_key = 'zzz' WHERE subject_id = 'ada'")
+    current = MasterKeyring.add_current(key_file)
+    with pytest.raises(SealError, match="1 blobs do not open"):
+        rewrap_keys(store)
+    assert set(count_wrapped(store)) == {current, "unreadable"}
+    with pytest.raises(SealError):
+        store.subjects.get("default", "ada")
 
 
 @pytest.mark.parametrize("enrolled", [True, False])
@@ -196,6 +283,16 @@ def test_a_lock_that_was_lifted_is_reported(store: TemplateStore, enrolled: bool
         assert reported(store) == lifted, change
     assert attempt(store) == "reject"
     assert reported(store) == lifted
+
+
+@pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
+@pytest.mark.parametrize("change", ["consecutive = 'x'", "last_failed_at = 'x'"])
+def test_a_count_that_cannot_be_read_is_reported(store: TemplateStore, change: str) -> None:
+    attempt(store)
+    write(store, f"UPDATE failed_attempts SET {change}")
+    with pytest.raises(StoreError, match="was altered"):
+        attempt(store)
+    assert reported(store) == [(COUNT_LIFTED, "a row that cannot be read")]
 
 
 def test_what_ends_a_count_rightly_is_not_reported(store: TemplateStore, clock: Clock) -> None:
