@@ -27,15 +27,16 @@ async def purge_regularly(
 
     def purge() -> None:
         # Before the rest: it is emptied from the log of the same round.
-        erased = store.erasures.erase_expired(keep)
-        if erased:
-            log("retention erased subjects", subjects=erased)
-        if not store.purge():
-            log(
-                "a reader of the database keeps its write-ahead log, with what was removed: it is "
-                "emptied another time",
-                severity=logging.WARNING,
-            )
+        try:
+            if erased := store.erasures.erase_expired(keep):
+                log("retention erased subjects", subjects=erased)
+        finally:
+            if not store.purge():
+                log(
+                    "a reader of the database keeps its write-ahead log, with what was removed: it "
+                    "is emptied another time",
+                    severity=logging.WARNING,
+                )
 
     # A thread of its own: requests in the default limiter do not delay it, nor it them.
     limiter = anyio.CapacityLimiter(1)

@@ -107,21 +107,21 @@ class Attempts:
         SealError
             If the row was altered or moved, or its master key is missing.
         """
-        probe = self._parameters(tenant, subject_id, token=token, contract_id=contract_id)
+        parameters = self._parameters(tenant, subject_id, token=token, contract_id=contract_id)
         database = self._context.database
         for _ in range(TRIES):
             with contextlib.suppress(_Superseded, RetiredRotation):
                 with database.read() as session:
-                    attempt = self._read(session, probe)
+                    attempt = self._read(session, parameters)
                 decided = compare(attempt)
                 with database.write() as session:
-                    refusal = self._record(session, probe, attempt, decided, by)
+                    refusal = self._record(session, parameters, attempt, decided, by)
                 break
         else:
             with database.write() as session:
-                attempt = self._read(session, probe)
+                attempt = self._read(session, parameters)
                 decided = compare(attempt)
-                refusal = self._record(session, probe, attempt, decided, by)
+                refusal = self._record(session, parameters, attempt, decided, by)
         if refusal is not None:
             raise refusal
         return decided
@@ -131,37 +131,42 @@ class Attempts:
 
         False if there was none of these.
         """
-        probe = self._parameters(tenant, subject_id)
+        parameters = self._parameters(tenant, subject_id)
         with self._context.database.write() as session:
-            counts = _state_of(session, _STATE, probe).FailedAttemptsRow
+            counts = _state_of(session, STATE_QUERY, parameters).FailedAttemptsRow
             lifts = counts is not None and counts.consecutive > 0
             if lifts:
                 counts.consecutive = 0
             outcome = "reset" if lifts else "nothing_held"
-            entry = Entry("lockout-reset", outcome, by, tenant, probe["pseudonym"])
+            entry = Entry("lockout-reset", outcome, by, tenant, parameters["pseudonym"])
             self._context.audit_log.append(session, entry)
             return lifts
 
     def status(self, tenant: str, subject_id: str) -> AttemptsStatus | None:
         """What is counted of a subject; None if no attempt on it ever failed."""
-        probe = self._parameters(tenant, subject_id)
+        parameters = self._parameters(tenant, subject_id)
         with self._context.database.read() as session:
-            return self._status(_state_of(session, _STATE, probe).FailedAttemptsRow)
+            return self._status(_state_of(session, STATE_QUERY, parameters).FailedAttemptsRow)
 
     def expire(self) -> int:
         """Remove the counts of subjects that did not fail for ninety days; returns how many."""
         due = FailedAttemptsRow.last_failed_at <= self._context.clock() - COUNT_RETENTION
         if self._policy.after:
             due &= FailedAttemptsRow.consecutive < self._policy.disable_at
-        with self._context.database.write() as session:
+        database = self._context.database
+        # Most rounds have nothing to remove: they wait for no write.
+        with database.read() as session:
+            if session.scalar(sa.select(FailedAttemptsRow.pseudonym).where(due).limit(1)) is None:
+                return 0
+        with database.write() as session:
             return delete(session, FailedAttemptsRow, due)
 
-    def _read(self, session: Session, probe: Mapping[str, Any]) -> Attempt:
+    def _read(self, session: Session, parameters: Mapping[str, Any]) -> Attempt:
         """Read all that a decision needs, and refuse early what :meth:`_record` would refuse.
 
         One query, and as many bytes, whether the subject is enrolled or not.
         """
-        state = _state_of(session, DECISION_QUERY, probe)
+        state = _state_of(session, DECISION_QUERY, parameters)
         if (refusal := self._refusal(state)) is not None:
             raise refusal
         subject, template = state.SubjectRow, None
@@ -172,7 +177,7 @@ class Attempts:
     def _record(
         self,
         session: Session,
-        probe: Mapping[str, Any],
+        parameters: Mapping[str, Any],
         attempt: Attempt,
         decided: Decided,
         by: By,
@@ -181,16 +186,16 @@ class Attempts:
 
         :class:`_Superseded` if the subject's template is not the one of `attempt`.
         """
-        state = _state_of(session, _STATE, probe)
+        state = _state_of(session, STATE_QUERY, parameters)
         refusal = self._refusal(state)
         if refusal is None:
-            self._count(session, state, probe["pseudonym"], attempt, accepted=decided.accepted)
+            self._count(session, state, parameters["pseudonym"], attempt, accepted=decided.accepted)
             outcome = "accept" if decided.accepted else "reject"
         else:
             refusal.recorded = True
             outcome = "replayed" if state.is_used else "locked_out"
-        token = None if state.is_used else probe["token"]
-        tenant, pseudonym = probe["tenant"], probe["pseudonym"]
+        token = None if state.is_used else parameters["token"]
+        tenant, pseudonym = parameters["tenant"], parameters["pseudonym"]
         entry = Entry("verify", outcome, by, tenant, pseudonym, decided.level, token)
         self._context.audit_log.append(session, entry)
         return refusal
@@ -249,7 +254,7 @@ class Attempts:
 
 
 # Made once: building a statement costs more than running it.
-_STATE: Any = (
+STATE_QUERY: Any = (
     sa.select(
         TenantRow,
         FailedAttemptsRow,
@@ -290,15 +295,15 @@ _STAND_IN = sa.func.coalesce(
 """The ciphertext of another subject, always the same one, which nobody opens: a template's bytes
 take a time that would tell who is enrolled."""
 
-DECISION_QUERY: Any = _STATE.options(SEALED).add_columns(
+DECISION_QUERY: Any = STATE_QUERY.options(SEALED).add_columns(
     sa.case((SubjectRow.id.is_(None), _STAND_IN)).label("stand_in")
 )
 """What a decision reads."""
 
 
-def _state_of(session: Session, query: Any, probe: Mapping[str, Any]) -> Any:
+def _state_of(session: Session, query: Any, parameters: Mapping[str, Any]) -> Any:
     """The one row of a query; :class:`UnknownTenant` where there is none."""
-    state = session.execute(query, probe).one_or_none()
+    state = session.execute(query, parameters).one_or_none()
     if state is None:
-        raise UnknownTenant(f"there is no tenant {probe['tenant']!r}")
+        raise UnknownTenant(f"there is no tenant {parameters['tenant']!r}")
     return state

@@ -104,5 +104,8 @@ class TemplateStore(StoreContext):
 
         False if a reader outlasted the wait: the log is emptied another time.
         """
-        self.attempts.expire()
-        return self.database.purge_log()
+        try:
+            self.attempts.expire()
+        finally:
+            emptied = self.database.purge_log()
+        return emptied
