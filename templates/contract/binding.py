@@ -67,7 +67,10 @@ class Binding(JsonValue):
         if not self.m < self.axes <= self.n:
             raise ContractError(f"m < axes <= n is needed: {self.m}, {self.axes}, {self.n}")
         if self.rotation_version != ROTATION_VERSION:
-            raise ContractError(f"this program turns templates by {ROTATION_VERSION!r} only")
+            raise ContractError(
+                f"this program turns templates by {ROTATION_VERSION!r} only: calibrate and enroll "
+                "anew"
+            )
         object.__setattr__(self, "preprocessing", plain_json(self.preprocessing))
 
     @cached_property

@@ -44,7 +44,7 @@ __all__ = [
 ]
 
 FORMAT = "veilface-contract"
-VERSION = 3
+VERSION = 4
 MAX_FILE_BYTES = 8 * 2**20
 MAX_CALIBRATIONS = 64
 

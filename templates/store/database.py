@@ -45,6 +45,7 @@ _UNAVAILABLE_CLASSES = {"08", "53", "57", "58"}  # connection, resources, operat
 _TABLE_MISSING = (
     "a table is missing: run `veilface db upgrade`; if it is missing afterwards, restore a backup"
 )
+_OTHER_VERSION = "the database was made by another version of this program: make it anew"
 _LOCK_NOT_AVAILABLE, _DEADLOCK, _SERIALISATION = "55P03", "40P01", "40001"
 
 # The server takes the columns in their order, so the limit, in milliseconds, holds for the lock.
@@ -114,8 +115,9 @@ class Database:
     def write(self, *, timeout: float | None = None) -> Iterator[Session]:
         """Give a session in one transaction, while no other write runs, and commit it.
 
-        Keep the block short. `timeout` is another one for other writes on PostgreSQL; 0 waits as
-        long as it takes. After :class:`StoreBusy`, as after any error, nothing was written.
+        Keep the block short. `timeout` replaces the database's own for waiting on other writes;
+        0 waits without limit. SQLite ignores it. After :class:`StoreBusy` nothing was written;
+        after :class:`StoreUnavailable` it may have been.
         """
         until = time.monotonic() + self._timeout
         # Rows stay readable after the commit.
@@ -258,6 +260,8 @@ def _translated(error: Exception) -> StoreError:
         state = getattr(cause, "sqlstate", None) or ""
         if state == "42P01":
             return StoreError(_TABLE_MISSING)
+        if state == "42703":
+            return StoreError(_OTHER_VERSION)
         if state in (_LOCK_NOT_AVAILABLE, _DEADLOCK, _SERIALISATION):
             return StoreBusy("another write, or a command on whole tables, takes too long")
         # The server answers with a state; without one the connection failed.
@@ -274,6 +278,8 @@ def _sqlite_error(cause: sqlite3.Error) -> StoreError:
     code = getattr(cause, "sqlite_errorname", "")
     if "no such table" in str(cause):
         return StoreError(_TABLE_MISSING)
+    if "no such column" in str(cause) or "has no column" in str(cause):
+        return StoreError(_OTHER_VERSION)
     if code.startswith(("SQLITE_CORRUPT", "SQLITE_NOTADB")):
         return StoreUnavailable("the SQLite file is damaged, or is not a database")
     if code.startswith("SQLITE_BUSY"):

@@ -76,6 +76,14 @@ def test_errors_never_quote_a_row(store: TemplateStore, database_url: str) -> No
     database.close()
 
 
+def test_a_table_without_a_column_is_of_another_version(store: TemplateStore) -> None:
+    execute(store.database, "ALTER TABLE subjects DROP COLUMN photos")
+    for work in (lambda: store.subjects.list("default"), lambda: put(store, "ada", b"wire")):
+        with pytest.raises(StoreError, match=r"another version.* make it anew") as caught:
+            work()
+        assert not isinstance(caught.value, StoreUnavailable)
+
+
 def test_no_server_is_store_unavailable() -> None:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
