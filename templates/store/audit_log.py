@@ -9,6 +9,7 @@ A one-use token is used up by the line of its use (``AuditRow.token``).
 """
 
 import hashlib
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -27,6 +28,7 @@ from templates.store.schema import AuditRow
 from templates.store.secrets import SecretName, Secrets
 
 TENANT_ERASE = "tenant-erase"
+_DIGEST = re.compile("[0-9a-f]{64}")
 
 
 @dataclass(frozen=True)
@@ -105,6 +107,8 @@ class AuditLog:
 
         :class:`BrokenAuditLog` if the head row is missing or forged. Adding to it would hide that.
         """
+        if not all(_DIGEST.fullmatch(name or "0" * 64) for name in (entry.pseudonym, entry.token)):
+            raise ValueError("a line names subject and token by digests")
         columns = {
             "at": self._clock().astimezone(UTC).isoformat(timespec="microseconds"),
             "tenant": entry.tenant,

@@ -214,6 +214,14 @@ def test_no_line_holds_a_subject_id_a_token_or_a_template(store: TemplateStore) 
         assert secret not in repr(rows)
 
 
+@pytest.mark.parametrize("name", ["pseudonym", "token"])
+def test_a_line_takes_nothing_but_digests_for_subject_and_token(
+    store: TemplateStore, name: str
+) -> None:
+    with pytest.raises(ValueError, match="digests"):
+        store.audit_log.record(Entry("enroll", "created", By(), **{name: "ada"}))
+
+
 def test_an_anchor_survives_its_text(filled: TemplateStore) -> None:
     head = filled.audit_log.head()
     assert Anchor.parse(str(head)) == head
