@@ -112,6 +112,8 @@ def _numbers(
     if start > len(raw):
         _refuse("truncated inside the header")
     header = raw[_LENGTH_BYTES:start]
+    if not header.startswith(b"{"):
+        _refuse("the header is not a JSON object")
     try:
         given: Any = parse_object(header, what="the header")
         m, n = given["basis"]["shape"]

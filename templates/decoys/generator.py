@@ -243,6 +243,8 @@ class DecoyGenerator:
             )
         if set(arrays) != set(_PARTS):
             raise DecoyError("the decoy generator has missing or unknown parts")
+        if any(part.dtype != np.float32 for part in arrays.values()):
+            raise DecoyError("the decoy generator holds numbers that are not float32")
         made = cls(**arrays, made_with=fields.get("made_with"))  # type: ignore[arg-type]
         if made.to_bytes() != data:
             raise DecoyError("the decoy generator is not in its canonical encoding")

@@ -245,7 +245,10 @@ class DecoyPool:
         plain = sealer.open(data.removeprefix(POOL_MAGIC), context=POOL_CONTEXT)
         fields, arrays = container.decode(plain, what="decoy pool", max_bytes=MAX_POOL_BYTES)
         if (fields.get("format"), fields.get("version")) != (_FORMAT, _VERSION):
-            raise DecoyError(f"this is not a decoy pool of version {_VERSION}")
+            raise DecoyError(
+                f"this is not a decoy pool of version {_VERSION}: build it with "
+                "`veilface decoys build`"
+            )
         labels = None
         if "labels" in arrays:
             labels = [Attributes(*label) for label in json.loads(arrays["labels"].tobytes())]
@@ -264,10 +267,14 @@ def _differs(label: Attributes, subject: Attributes) -> bool:
 
 def load_source(path: Path, sealer: Sealer) -> DecoyPool | DecoyGenerator:
     """Load a sealed pool or a plain generator, told apart by the first bytes of the file."""
-    data = container.read_bounded(path, MAX_POOL_BYTES)
-    if data.startswith(POOL_MAGIC):
-        return DecoyPool.open(data, sealer)
-    return DecoyGenerator.from_bytes(data)
+    try:
+        with path.open("rb") as file:
+            is_pool = file.read(len(POOL_MAGIC)) == POOL_MAGIC
+    except OSError as error:
+        raise DecoyError(f"cannot read {path.name}: {error.strerror}") from error
+    if is_pool:
+        return DecoyPool.open(container.read_bounded(path, MAX_POOL_BYTES), sealer)
+    return DecoyGenerator.load(path)
 
 
 def client_source(source: DecoySource) -> DecoyGenerator:

@@ -216,6 +216,7 @@ def test_malformed_containers_are_refused():
         (packed(twice, payload), "duplicate key"),
         (packed(both_feet, payload), "duplicate key"),
         (packed(b"[]", payload), "not a JSON object"),
+        (packed(b" " + text, payload), "not a JSON object"),
         (packed(b"{", payload), "not valid JSON"),
         (packed(b"{\xff\xfe}", payload), "not valid JSON"),
         (packed(deep, payload), "not valid JSON"),

@@ -252,6 +252,16 @@ def test_hostile_headers_are_refused(data: bytes) -> None:
         DecoyGenerator.from_bytes(data)
 
 
+@pytest.mark.parametrize("dtype", [np.complex64, np.float64])
+def test_numbers_of_another_type_are_refused_before_they_are_cast(
+    fitted: DecoyGenerator, dtype: type[np.generic]
+) -> None:
+    fields, arrays = container.decode(fitted.to_bytes(), what="x", max_bytes=MAX_GENERATOR_BYTES)
+    data = container.encode(fields, {name: part.astype(dtype) for name, part in arrays.items()})  # type: ignore[arg-type]
+    with pytest.raises(DecoyError, match="not float32"):
+        DecoyGenerator.from_bytes(data)
+
+
 def test_foreign_encodings_of_the_same_content_are_refused(fitted: DecoyGenerator) -> None:
     """One content has one id, so a padded header may not decode."""
     data = fitted.to_bytes()
