@@ -4,6 +4,7 @@ The commands themselves run in the tests of the command line; those of the READM
 clients and the examples in tests of their own.
 """
 
+import ast
 import json
 import re
 import shlex
@@ -118,6 +119,22 @@ def broken_files(root: Path) -> list[str]:
 def test_the_command_line_accepts_every_command() -> None:
     assert sum(1 for each in snippets(ROOT) for _ in command_lines(each.code)) > 50
     assert refused_commands(ROOT) == []
+
+
+def test_every_command_that_a_message_names_exists() -> None:
+    """In any string of the product: messages, help and docstrings."""
+    packages = ("api", "attacks", "clients", "enroll", "models", "templates", "verify")
+    named = set()
+    for path in (each for package in packages for each in (ROOT / package).rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                named |= set(
+                    re.findall(r"`veilface\s+([a-z][a-z-]*(?:\s+[a-z][a-z-]*)*)", node.value)
+                )
+    assert len(named) > 20
+    for words in map(str.split, named):
+        command, _, rest = descend(words)
+        assert not (rest and hasattr(command, "commands")), words
 
 
 def test_every_link_leads_to_a_file() -> None:

@@ -30,7 +30,7 @@ def check_keys(keys: Sequence[bytes], *, source: str) -> None:
         if len(key) != KEY_BYTES:
             raise SealError(
                 f"key {number} of {source} has {len(key)} bytes, not {KEY_BYTES}: "
-                "make one with `veilface keys master`"
+                "restore it from a copy"
             )
     if len(set(keys)) != len(keys):
         raise SealError(f"{source} holds the same key twice")
@@ -57,7 +57,11 @@ def read_key_file(path: Path) -> tuple[list[bytes], Stamp]:
     """Read and check the keys of a private file; :class:`SealError` says what is wrong."""
     source, folder = f"the key file {path}", path.resolve().parent
     if not path.exists():
-        raise SealError(f"{source} does not exist: make it with `veilface keys master`")
+        raise SealError(
+            f"{source} does not exist: restore it from a copy; the first `veilface setup`, "
+            "`veilface calibrate` or `veilface serve` makes one for an empty database, and "
+            "`openssl rand -base64 32` one for exports"
+        )
     try:
         refuse_another_users(path)
     except PermissionError as error:
