@@ -208,8 +208,8 @@ class Enroller:
     def from_export(self, data: bytes, *, holder_salt: str | None = None) -> Enrollment:
         """Enroll the template of an export that a service sealed, without the tenant's rotation.
 
-        As :meth:`from_template`, for a template that was made of photos by the service itself, or
-        that a holder's rotation turns still: then ``holder_salt`` is that rotation's.
+        As :meth:`from_template`, for a template that was made of photos by the service itself. If a
+        holder's rotation still applies, ``holder_salt`` is its salt.
         """
         return self._spanned_anew(self._received(data), holder_salt)
 

@@ -15,7 +15,7 @@ from pydantic import BaseModel, PlainValidator, ValidationError
 from models.pack import ModelPack
 from templates.contract import wire
 from templates.contract.binding import Binding
-from templates.contract.parsing import Cosine
+from templates.contract.parsing import Cosine, refused
 from templates.decoys import DecoyGenerator
 from templates.errors import ContractError
 from templates.keys.randomness import Keystream
@@ -40,7 +40,7 @@ class PublicContract(BaseModel):
     calibrations: list[ProbeCalibration]
 
     @classmethod
-    def read(cls, document: Mapping[str, object]) -> Self:
+    def read(cls, document: object) -> Self:
         """Read the JSON object of ``GET /v1/contract``, or of the contract file.
 
         Raises
@@ -48,12 +48,12 @@ class PublicContract(BaseModel):
         ContractError
             It is no contract, or contradicts itself.
         """
+        if not isinstance(document, Mapping):
+            raise ContractError("the contract is not a JSON object")
         try:
             contract = cls.model_validate(document)
         except ValidationError as error:
-            first = error.errors(include_input=False)[0]
-            place = ".".join(map(str, first["loc"]))
-            raise ContractError(f"the contract, {place}: {first['msg'].lower()}") from None
+            raise refused("the contract", error) from None
         if contract.contract_id != contract.binding.contract_id:
             raise ContractError("the contract_id is not the hash of the binding")
         return contract

@@ -8,7 +8,6 @@ The checks are made where a value is read, and before a contract is written. A v
 code makes is not checked again.
 """
 
-import dataclasses
 from collections.abc import Mapping
 from functools import cache
 from typing import Annotated, Any, ClassVar, Self
@@ -21,6 +20,13 @@ from templates.errors import ContractError
 Share = Annotated[float, Field(ge=0, le=1)]
 Cosine = Annotated[float, Field(ge=-1, le=1)]
 Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+
+
+def refused(what: str, error: ValidationError) -> ContractError:
+    """Say what is wrong first, and where; pydantic's own text quotes the input."""
+    first = error.errors(include_input=False, include_url=False, include_context=False)[0]
+    place, said = ".".join(map(str, first["loc"]))[:100], first["msg"]
+    return ContractError(f"{what}{place and f', {place}'}: {said[:1].lower()}{said[1:]}")
 
 
 class JsonValue:
@@ -60,13 +66,7 @@ class JsonValue:
         try:
             made: Self = cls._adapter().validate_json(canonical_json({**value, **unwritten}))
         except ValidationError as error:
-            # Its own text quotes the input.
-            first = error.errors(include_input=False, include_url=False, include_context=False)[0]
-            known = {entry.name for entry in dataclasses.fields(cls)}  # type: ignore[arg-type]
-            place = ": ".join(str(part) for part in first["loc"][:1] if part in known)
-            raise ContractError(
-                f"{cls.what}{f', {place}' if place else ''}: {first['msg'].lower()}"
-            ) from None
+            raise refused(cls.what, error) from None
         if canonical_json(made.to_json()) != canonical_json(value):
             raise ContractError(
                 f"{cls.what} has an entry too many or too few, or one that contradicts the others"

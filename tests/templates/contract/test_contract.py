@@ -349,18 +349,25 @@ def test_another_kind_of_file_is_refused(tmp_path: Path, key: str, value: Any) -
         reloaded(tmp_path / "contract.json", document | {key: value})
 
 
+def wrong_threshold() -> dict[str, Any]:
+    calibration: dict[str, Any] = make_calibration().to_json()
+    calibration["levels"][0]["score_threshold"] = "high"
+    return calibration
+
+
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
         ({"photo_consistency": "0.25"}, "photo_consistency: "),
         ({"photo_consistency": None}, "photo_consistency: "),
-        ({"template_foot_point_norm": [0.1, True]}, "template_foot_point_norm: "),
-        ({"binding": {}}, "binding: "),
+        ({"template_foot_point_norm": [0.1, True]}, r"template_foot_point_norm\.1: input"),
+        ({"binding": {}}, "binding"),
         ({"default_level": "no such\n"}, "default_level: "),
         ({"contract_id": "0" * 64}, "contradicts"),
+        ({"calibrations": [wrong_threshold()]}, r"calibrations\.0\.levels\.0\.score_threshold: "),
         ({"surprise": 1}, "too many"),
         ({"verdict": {"privacy": VERDICT.privacy.to_json() | {"status": "FAIL"}}}, "contradicts"),
-        ({"liveness": LIVENESS.to_json() | {"bpcer": {}}}, "liveness: "),
+        ({"liveness": LIVENESS.to_json() | {"bpcer": {}}}, "liveness"),
     ],
 )
 def test_a_value_of_another_type_or_range_is_refused(changes: dict[str, Any], reason: str) -> None:
