@@ -86,12 +86,17 @@ def assert_renewed(data: Path, known: dict[str, Any]) -> None:
 
 def test_it_renews_all_and_says_what_is_left_to_do(used: tuple[Path, dict[str, Any]]) -> None:
     data, known = used
+    with opened(data) as store:
+        earlier = str(store.audit_log.head())
     ran = renew(data)
     assert ran.status == 0, ran.stderr
     assert_renewed(data, known)
     with opened(data) as store:
         (key,) = store.api_keys.all()
         anchor = str(store.audit_log.head())
+        assert next(store.audit_log.lines()).action == "secrets-renew"
+        with pytest.raises(StoreError):
+            verify_archive(data / "archive.jsonl", store.signer.public_key())
     for said in (
         f"anchor: {anchor}\n",
         "enroll again default: ada, bob\n",
@@ -103,7 +108,8 @@ def test_it_renews_all_and_says_what_is_left_to_do(used: tuple[Path, dict[str, A
     before = public_key_of(known["secrets"][SecretName.RECEIPT])
     assert verify_archive(data / "archive.jsonl", before).lines > 0
     # The log goes on where the archive ends.
-    assert run("audit-log", "verify", "--anchor", anchor, "--data-dir", data).status == 0
+    for each in (earlier, anchor):
+        assert run("audit-log", "verify", "--anchor", each, "--data-dir", data).status == 0
 
 
 class Steps:

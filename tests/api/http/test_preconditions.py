@@ -98,5 +98,5 @@ def test_an_erasure_does_not_pass_over_them(
 def test_any_other_precondition_is_refused(client: Client, headers: dict[str, str]) -> None:
     answer = client.put(path("other"), files=images(photo(3)), headers=headers)
     assert assert_error(answer, 422, "validation_failed")["field"] == "If-Match, If-None-Match"
-    assert "0123" not in answer.text
+    assert "0123" not in answer.json()["error"]["message"]
     assert client.get("/v1/subjects/other").status_code == 404
