@@ -9,6 +9,7 @@ from typing import Any
 import anyio
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.requests import ClientDisconnect, Request
+from starlette.routing import Match
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from api.http.audit import note_refusal
@@ -28,6 +29,7 @@ SECURITY_HEADERS = {
     "Content-Security-Policy": "default-src 'none'; frame-ancestors 'none'",
     "Referrer-Policy": "no-referrer",
 }
+METHODS = ("DELETE", "GET", "HEAD", "POST", "PUT")
 HSTS = "max-age=31536000"
 HEALTH_PATHS = frozenset({"/health/live", "/health/ready"})
 """Paths without a rate limit: what watches the service must see an overload."""
@@ -130,6 +132,8 @@ async def _refusal(request: Request, error: Exception) -> ApiError:
     refusal = api_error(error)
     fields = request.state.log
     fields["code"] = refusal.code
+    if refusal.code == "method_not_allowed":
+        refusal.headers = {"Allow": _methods(request.scope)}
     if error is not refusal:
         # The exception's text may hold anything; its type is all that leaves this place.
         fields["error_type"] = type(error).__name__
@@ -138,6 +142,16 @@ async def _refusal(request: Request, error: Exception) -> ApiError:
     request.app.state.readiness.note(error)
     await note_refusal(request, refusal, error)
     return refusal
+
+
+def _methods(scope: Scope) -> str:
+    """List the methods of all routes at a path; the framework names one route's only."""
+
+    def taken(method: str) -> bool:
+        asked = {**scope, "method": method}
+        return any(route.matches(asked)[0] is Match.FULL for route in scope["app"].routes)
+
+    return ", ".join(filter(taken, METHODS))
 
 
 async def _require_few_requests(scope: Scope) -> None:

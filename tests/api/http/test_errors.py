@@ -142,6 +142,10 @@ def test_framework_errors_have_the_one_shape(
         assert answer.headers["allow"]
 
 
+def test_allow_names_all_methods_of_the_path(client: Client) -> None:
+    assert client.request("PATCH", "/v1/subjects/a").headers["allow"] == "DELETE, GET"
+
+
 def test_a_request_id_is_taken_over_only_when_it_is_sane(client: Client) -> None:
     assert client.get("/health/live", headers={"X-Request-ID": "trace-0123456789"}).json() == {
         "status": "ok",
