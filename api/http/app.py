@@ -13,8 +13,10 @@ import anyio
 import anyio.to_thread
 from fastapi import Depends, FastAPI, Request
 from fastapi.exceptions import RequestValidationError
+from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.middleware.cors import CORSMiddleware
+from starlette.types import ASGIApp
 
 from api.http.context import RequestContext
 from api.http.deps import refuse_unknown
@@ -63,6 +65,15 @@ API = (
     transfer,
     health,
 )
+
+
+class Cors(CORSMiddleware):
+    """Starlette's, but the application answers a preflight that is refused, in the one shape."""
+
+    def preflight_response(self, request_headers: Headers) -> ASGIApp:  # type: ignore[override]
+        """Return what answers a preflight."""
+        answer = super().preflight_response(request_headers)
+        return answer if answer.status_code == 200 else self.app
 
 
 CORS_METHODS = ("GET", "PUT", "POST", "DELETE")
@@ -149,7 +160,7 @@ def _add_middleware(app: FastAPI, settings: Settings) -> None:
         # Keys travel in headers and never in a cookie, so credentials are not allowed: a page can
         # call with a key that it has, and with nothing that the browser keeps for the service.
         app.add_middleware(
-            CORSMiddleware,
+            Cors,
             allow_origins=sorted(settings.allowed_origins),
             allow_methods=CORS_METHODS,
             allow_headers=CORS_REQUEST_HEADERS,
