@@ -50,9 +50,12 @@ async def check_photo(call: EnrollsOrVerifies) -> PhotoCheckAnswer:
                 return PhotoCheckAnswer(
                     usable=False, code=code, message=str(refusal), details=details
                 )
+            message = "one face, large and clear enough"
+            if taken.box is None:
+                message = "an aligned crop of a face, clear enough"
             return PhotoCheckAnswer(
                 usable=True,
-                message="one face, large and clear enough",
+                message=message,
                 box=None if taken.box is None else [round(side, 1) for side in taken.box],
                 quality=asdict(taken.quality),
             )

@@ -31,6 +31,7 @@ def test_a_photo_that_would_do(client: Client) -> None:
     assert body["usable"] is True
     assert body["code"] is None
     assert body["box"] is None  # this pack has no detector
+    assert body["message"] == "an aligned crop of a face, clear enough"
     assert body["quality"]["sharpness"] > 0.5
 
 
