@@ -5,6 +5,7 @@ types, and Starlette writes parts over 1 MiB to a temporary file, where a face h
 be.
 """
 
+import codecs
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
@@ -21,7 +22,7 @@ from api.http.errors import ApiError, refuse_unknown_names, wrong_value
 from api.http.requests import MAX_EMBEDDING, Body, how_to_send, too_many_images
 from api.limits.admission import MAX_JSON_BYTES, read_limited, stream_limited
 from templates.contract.canonical import parse_object, too_many_parts
-from templates.errors import ContractError, InvalidEmbedding, InvalidTemplate
+from templates.errors import ContractError, InvalidEmbedding
 from verify import MAX_PROBE_PHOTOS
 
 _FORM, _JSON = "multipart/form-data", "application/json"
@@ -141,7 +142,7 @@ async def read_json(request: Request, model: type[B], *, photos: str | None = No
 
 def _parsed(model: type[B], body: bytes, photos: str | None) -> B:
     try:
-        values = parse_object(body, what="the body")
+        values = parse_object(body.removeprefix(codecs.BOM_UTF8), what="the body")
     except ContractError as error:
         raise ApiError("malformed_request", str(error)) from None
     return _checked(model, values, photos)
@@ -160,8 +161,12 @@ def _checked(model: type[B], values: Mapping[str, Any], photos: str | None) -> B
             f"an embedding is a list of 1 to {MAX_EMBEDDING} numbers, and embeddings are 1 to "
             f"{MAX_PROBE_PHOTOS} of them"
         )
-    if problem["type"] == "base64_decode":
-        raise InvalidTemplate(f"{name} is not base64")
+    if name == "attributes":
+        raise ApiError(
+            "validation_failed",
+            "attributes must be a JSON object with texts for gender and race, or one of them",
+            {"field": name},
+        )
     if name == photos and problem["type"] == "too_long":
         raise too_many_images(problem["ctx"]["max_length"])
     raise wrong_value(problem, name, remedy if name in (photos, None) else "")

@@ -56,8 +56,8 @@ ERROR_CODES = {
     ),
     "invalid_embedding": ErrorCode(
         400,
-        "The embedding is not a finite unit vector of n numbers, or has no part along the "
-        "contract's axes.",
+        "The embedding is not a unit vector of n numbers, or has no part along the contract's "
+        "axes.",
     ),
     "unauthorized": ErrorCode(401, "The API key or token is missing, unknown or revoked."),
     "replayed": ErrorCode(401, "The challenge or the token was used before, or has expired."),

@@ -4,18 +4,19 @@ OpenAPI describes them as they stand here, and a body is read into one after aut
 (``api.http.bodies``). A name that a model does not have is refused. No message repeats a value.
 """
 
+import base64
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import (
     AfterValidator,
-    Base64Bytes,
     BaseModel,
     ConfigDict,
     Field,
     Json,
     PlainValidator,
+    ValidationInfo,
     WithJsonSchema,
     model_validator,
 )
@@ -23,7 +24,7 @@ from pydantic import (
 from api.http.errors import ApiError
 from enroll.enroller import MAX_PHOTOS
 from models.selection import FacePolicy
-from templates.errors import InvalidEmbedding, SealError
+from templates.errors import InvalidEmbedding, InvalidTemplate, SealError
 from templates.keys.holder_key import PATTERN as HOLDER_KEY_PATTERN
 from templates.keys.holder_key import decode_holder_key
 from templates.store.identifiers import SUBJECT_ID_RULE, checked_subject_id
@@ -50,6 +51,17 @@ def _printable(text: str) -> str:
     if not text.isprintable():
         raise ValueError("must be printable characters")
     return text
+
+
+def _decoded(value: Any, info: ValidationInfo) -> bytes:
+    if not isinstance(value, str):
+        raise ValueError("must be a base64 string")
+    try:
+        return base64.b64decode(value, validate=True)
+    except ValueError:
+        raise InvalidTemplate(
+            f"{info.field_name} is not base64 (standard alphabet, padded)"
+        ) from None
 
 
 def _holder_key(value: Any) -> bytearray:
@@ -83,7 +95,7 @@ Level = Annotated[
         examples=["fmr-1e-3"],
     ),
 ]
-Base64 = Annotated[Base64Bytes, Field(strict=False), WithJsonSchema({"type": "string"})]
+Base64 = Annotated[bytes, PlainValidator(_decoded), WithJsonSchema({"type": "string"})]
 HolderKey = Annotated[
     bytearray,
     PlainValidator(_holder_key),
@@ -157,8 +169,10 @@ class VerifyForm(Body):
 
     @model_validator(mode="after")
     def _as_many_as_there_should_be(self) -> Self:
-        if bool(self.image) == bool(self.images):
-            raise ValueError(how_to_send("image"))
+        if not self.photos:
+            raise ValueError("send at least one photo")
+        if self.image and self.images:
+            raise ValueError("send image or images, not both")
         if self.challenge_id is None:
             if len(self.photos) > MAX_PROBE_PHOTOS:
                 raise too_many_images(MAX_PROBE_PHOTOS)

@@ -107,6 +107,9 @@ def test_a_template_enrolls(client: Client, deployment: Deployment) -> None:
     answer = client.put(path("lifted"), json={"template": b64(lifted(deployment))})
     body = assert_answer(answer, 201, EnrollmentAnswer)
     assert body["images"] == []
+    marked = json.dumps({"template": b64(lifted(deployment))}).encode("utf-8-sig")
+    sent = client.put(path("x"), content=marked, headers={"Content-Type": "application/json"})
+    assert sent.status_code == 201
     described = client.get("/v1/subjects/lifted").json()
     assert (described["enrolled_by"], described["photos"]) == ("template", 0)
     descriptor = unit(np.random.default_rng([5, 0]).normal(size=(1, N)))[0]
@@ -120,6 +123,9 @@ def test_broken_templates_are_refused(client: Client, deployment: Deployment) ->
     cases = [
         ("", 400, "invalid_template"),
         ("not base64!", 400, "invalid_template"),
+        ("@@@", 400, "invalid_template"),
+        (b64(whole).replace("A", "*A", 1), 400, "invalid_template"),
+        (b64(whole) + "\n", 400, "invalid_template"),
         (b64(whole[:-1]), 400, "invalid_template"),
         (b64(whole + b"\x00"), 400, "invalid_template"),
         (b64(b"\x00" * 100), 400, "invalid_template"),
@@ -152,6 +158,8 @@ def test_fields_are_checked(client: Client) -> None:
         answer = client.put(path("x"), **case)  # type: ignore[arg-type]
         assert_error(answer, 422, "validation_failed")
         assert "SECRET" not in answer.text
+        if "attributes" in case.get("data", {}):
+            assert "with texts for gender and race" in answer.text
     for content_type in ("text/plain", "application/x-www-form-urlencoded", "image/png"):
         answer = client.put(path("x"), content=photo(1), headers={"Content-Type": content_type})
         assert_error(answer, 400, "malformed_request")

@@ -99,6 +99,21 @@ PHOTO = photo(1)
 BASE64 = base64.b64encode(PHOTO).decode()
 
 
+def test_photos_under_no_name_or_two_are_told_the_cause_and_the_remedy_once(
+    client: Client,
+) -> None:
+    both = [("image", PHOTO), ("images", PHOTO)]
+    for sent, cause in (
+        ({"level": (None, "fmr-1e-3")}, "send at least one photo; "),
+        (both, "send image or images, not both; "),
+    ):
+        answer = client.post("/v1/subjects/alice/verify", files=sent)
+        assert_error(answer, 422, "validation_failed")
+        message = answer.json()["error"]["message"]
+        assert message.startswith(cause)
+        assert message.count("@photo.jpg") == 1
+
+
 @pytest.mark.parametrize(
     ("method", "path", "field"),
     [
