@@ -12,6 +12,7 @@ from api.http.app import create_app
 from api.http.errors import StartError
 from api.service.opening import file_sealer, open_keyring, open_store
 from api.service.runtime import Runtime
+from tests.api.calls import embedding
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, deploy, images, photo
 from tests.api.shapes import assert_error
@@ -82,6 +83,16 @@ def test_what_is_below_the_level_of_the_deployment_is_forbidden(
         assert level_of(ask(headers, STRICT)) == STRICT
         assert level_of(ask(headers)) == STRICT
         assert_error(ask(headers, "fmr-1e-9"), 422, "uncalibrated")
+
+
+def test_an_embedding_is_held_to_the_level_too(
+    strict_service: tuple[Client, Deployment],
+) -> None:
+    client, deployment = strict_service
+    sent = {"embedding": embedding(client, 1), "level": LAX}
+    headers = key(deployment, None)
+    answer = client.post("/v1/subjects/a/verify", headers=headers, json=sent)
+    assert assert_error(answer, 403, "forbidden") == {"lowest_level": STRICT}
 
 
 def test_what_is_below_the_level_of_the_key_is_forbidden(
