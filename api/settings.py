@@ -115,7 +115,6 @@ class Settings(BaseSettings):
     )
     providers: Annotated[tuple[str, ...], NoDecode, BeforeValidator(_parts)] = Field(
         ("cpu",),
-        min_length=1,
         description="ONNX Runtime providers in order of preference, separated by commas.",
     )
     onnx_threads: int = Field(
@@ -140,7 +139,7 @@ class Settings(BaseSettings):
     port: int = Field(8421, ge=0, le=65535, description="Port to listen on; 0 takes a free one.")
     open_metrics: bool = Field(
         False,
-        description="Answer `/metrics` without an API key with the right `metrics`.",
+        description="Answer `/metrics` to everybody, without an API key.",
     )
     tls_certificate: Path | None = Field(
         None,
@@ -154,7 +153,8 @@ class Settings(BaseSettings):
     trusted_proxies: str = Field(
         "127.0.0.1",
         description="Addresses or networks of reverse proxies, separated by commas, whose "
-        "`X-Forwarded-For` and `X-Forwarded-Proto` are believed; or `none`, or `*` for all.",
+        "`X-Forwarded-For` and `X-Forwarded-Proto` are believed; or `none`; or `*` for all: a "
+        "client can then choose its address, which defeats the address limit.",
     )
     cors_origins: str = Field(
         NONE,
@@ -173,10 +173,9 @@ class Settings(BaseSettings):
     )
     rate_limit_storage: str = Field(
         "memory://",
-        pattern=r"^(memory://$|rediss?://)",
-        description="Where requests are counted. `memory://`: in each worker for itself. "
-        "`redis://USER:PASSWORD@HOST/NUMBER` or `rediss://…`: in one place, for all workers and "
-        "hosts; needs `veilface[redis]`.",
+        description="Where requests are counted. `memory://`: in each worker for itself, so that "
+        "up to `workers` times the limit may pass. `redis://USER:PASSWORD@HOST/NUMBER` or "
+        "`rediss://…`: in one place, for all workers and hosts; needs `veilface[redis]`.",
     )
     lowest_level: str | None = Field(
         None,
@@ -261,6 +260,20 @@ class Settings(BaseSettings):
             limit = None
         if limit is None or limit.amount < 1:
             raise ValueError("write one COUNT/second, minute, hour or day, of at least one, or off")
+        return value
+
+    @field_validator("providers")
+    @classmethod
+    def _some_provider(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        if not value:
+            raise ValueError("name at least one provider, for example cpu")
+        return value
+
+    @field_validator("rate_limit_storage")
+    @classmethod
+    def _known_storage(cls, value: str) -> str:
+        if value != "memory://" and not value.startswith(("redis://", "rediss://")):
+            raise ValueError("must be memory:// or begin with redis:// or rediss://")
         return value
 
     @field_validator("trusted_proxies")

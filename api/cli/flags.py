@@ -22,7 +22,13 @@ PublicKey = Annotated[
     str, typer.Option(help="The receipt key in base64, or a file with `GET /v1/contract`.")
 ]
 Aligned = Annotated[bool, typer.Option("--aligned", help="The photos are aligned square crops.")]
-Flip = Annotated[bool, typer.Option("--flip", help="Add the mirrored face, here and everywhere.")]
+Flip = Annotated[
+    bool,
+    typer.Option(
+        "--flip",
+        help="Add the embedding of the mirrored face; decoys and contract must agree on it.",
+    ),
+]
 Cache = Annotated[
     Path | None, typer.Option(help="Sealed file of embeddings, so that the next run is quick.")
 ]
