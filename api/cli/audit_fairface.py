@@ -90,7 +90,8 @@ def fairface(
     if decoys is not None or settings.resolved_decoys_file.is_file():
         source = bulk.decoys(decoys)
         if not isinstance(source, DecoyGenerator):
-            raise UsageError("--decoys takes a generator, and this is a pool")
+            file = decoys or settings.resolved_decoys_file
+            raise UsageError(f"{file} is a pool: name the file of a generator by --decoys")
         generator = source
         if (served := bulk.served_contract(source)) is not None:
             axes, service_dims = served.binding.axes, (served.binding.m,)

@@ -81,6 +81,8 @@ def templates(
         comparison=comparison,
         seed=seed,
     )
+    if contract is None:
+        message(f"note: auditing a scheme of no service: {plan.strategy}, m {dim or 64}")
     labelled = labelled_folder(people)
     faces = bulk.extract(labelled.paths)
     name_of = dict(zip(labelled.paths, labelled.identities, strict=True))

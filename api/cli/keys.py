@@ -10,7 +10,7 @@ from api.cli import flags, master_keys
 from api.cli.console import message, progress
 from api.cli.errors import CommandError
 from api.cli.options import STORE, reports
-from api.cli.results import Result
+from api.cli.results import Result, shown_facts
 from api.cli.store import opened_store, read_public_key
 from api.http.audit import operator
 from api.http.receipts import verify_answer
@@ -86,7 +86,9 @@ def list_keys(
     Example: `veilface keys list --tenant default`
     """
     with opened_store(settings) as store:
-        return Result([_described(key) for key in store.api_keys.all(tenant=tenant)])
+        keys = [_described(key) for key in store.api_keys.all(tenant=tenant)]
+    none = "There are no API keys: `veilface keys create` makes one"
+    return Result(keys, list(shown_facts(keys, "API keys")) if keys else none)
 
 
 @app.command()

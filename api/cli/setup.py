@@ -41,7 +41,7 @@ from verify.evaluation.attributes import resembling_rows
 from verify.preparation import SAME_PHOTO, acquired, make_generator
 
 RIGHTS = (Right.ENROLL, Right.VERIFY, Right.ERASE, Right.SCORES, Right.ADMIN)
-"""Of the key that is made: all that the page shows, with distances, locks and the audit log."""
+"""Of the operator's key: all that the page shows, and the calls for lockouts and audit log."""
 
 
 @reports("pack", "providers", "data_dir", "master_key_file")

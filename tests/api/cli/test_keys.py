@@ -42,7 +42,11 @@ def test_a_key_is_made_listed_and_revoked(veilface, store):
     listed = veilface("keys", "list", "--json")
     assert [(key["prefix"], key["label"]) for key in listed.json] == [(prefix, "shop")]
     assert token not in listed.stdout
-    assert prefix in veilface("keys", "list").stdout
+    shown = veilface("keys", "list").stdout
+    assert shown.startswith("API keys")
+    assert prefix in shown
+    none = veilface("keys", "list", "--tenant", "nobody").stdout
+    assert none == "There are no API keys: `veilface keys create` makes one\n"
 
     assert veilface("keys", "revoke", prefix).status == 0
     assert store.api_keys.verify(token) is None
