@@ -102,6 +102,20 @@ def test_what_does_not_fit_stops_the_start_with_a_sentence(world, data, tmp_path
     assert "Traceback" not in broken.stderr
 
 
+@pytest.mark.parametrize(
+    ("flags", "sentence"),
+    [
+        (("--tls-certificate", "absent.pem", "--tls-key", "absent.pem"), "they must be PEM files"),
+        (("--rate-limit-storage", "redis://user:hunter2@host:port/x"), "rate_limit_storage"),
+    ],
+)
+def test_the_check_looks_at_the_tls_key_and_the_rate_limit_storage(world, data, flags, sentence):
+    ran = run("serve", "--check", "--data-dir", data, "--pack", world.pack, *flags)
+    assert ran.status == 1
+    assert sentence in ran.stderr
+    assert "hunter2" not in ran.stderr
+
+
 def test_a_taken_port_is_named(world, data):
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
