@@ -300,6 +300,21 @@ def test_a_template_that_does_not_open_is_said_and_the_rest_is_moved(store: Temp
     assert store.rerotation.retire("default") == 1
 
 
+@pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
+def test_cells_that_cannot_be_read_stop_no_other_row(store: TemplateStore) -> None:
+    people = People(store, 3)
+    people.enroll(*people.names)
+    execute(
+        store.database,
+        "UPDATE subjects SET source = 'zzz' WHERE subject_id = 's000'",
+        "UPDATE subjects SET wrapped_key = 'zzz' WHERE subject_id = 's001'",
+    )
+    store.rerotation.begin("default")
+    with pytest.raises(StoreError, match="1 templates"):
+        store.rerotation.move("default", people.binding)
+    assert store.rerotation.subjects_of_old_epochs("default") == ["s001"]
+
+
 def test_an_enrollment_under_way_is_waited_for_before_a_key_goes(
     store: TemplateStore,
     database_url: str,
