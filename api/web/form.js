@@ -50,6 +50,7 @@ export function photoForm(id, view) {
     if (picker) {
       picker.root.hidden = moving() || lifts();
       if (picker.root.hidden) picker.start();
+      if (lifts()) picker.drop(picker.chosen());
     }
     rest();
   }
@@ -71,7 +72,7 @@ export function photoForm(id, view) {
 
   async function submit(event) {
     event.preventDefault();
-    if (fields.disabled) return;
+    if (fields.disabled || lifts()) return;
     const pressed = document.activeElement;
     clear();
     fields.disabled = true;

@@ -41,8 +41,8 @@ export function photoPicker({ most, sends = null, onchange }) {
 
   // A burst, some files or a cartoon: what is chosen at one time.
   function take(together) {
-    // The view was left while they were on their way.
-    if (ended.signal.aborted) return;
+    // The view was left, or private mode switched on, while they were on their way.
+    if (ended.signal.aborted || root.hidden) return;
     if (sends) [...photos].forEach(remove);
     const room = most - photos.length;
     together.slice(0, room).forEach(add);

@@ -204,6 +204,29 @@ def test_what_private_mode_cannot_serve_goes_to_the_service_and_that_is_said(
     expect(switch).to_be_enabled()
 
 
+def test_photos_that_were_chosen_before_private_mode_are_not_sent(
+    recording: Proxy, served: Served, open_tab: OpenTab, people: dict[str, list[Path]]
+) -> None:
+    tab = open_tab(served)
+    page = tab.page
+    switch = page.get_by_role("switch", name="Private mode")
+    switch.uncheck()
+    tab.choose_files(people[WHO][0])
+    tab.good(1)
+    recording.forget()
+    switch.check()
+    tab.name_person("anna")
+    page.get_by_label("Person’s id").press("Enter")
+    page.locator("form").evaluate("(form) => form.requestSubmit()")
+    page.get_by_text("Options", exact=True).click()
+    page.get_by_label("use the largest face").check()
+    switch.uncheck()
+    expect(page.locator(".tray li")).to_have_count(0)
+    tab.open("People")
+    expect(page.get_by_text("Nobody is enrolled yet")).to_be_visible()
+    assert {call for call in requests_in(recording.sent)[0] if not call.startswith("GET ")} == set()
+
+
 def test_what_keeps_private_mode_from_working_is_said_and_nothing_else_is_sent(
     recording: Proxy,
     served: Served,
