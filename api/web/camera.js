@@ -2,7 +2,7 @@
 // says so. The photos that count are taken at full size, a burst of three.
 
 import { h } from "./dom.js";
-import { Problem, call, form } from "./service.js";
+import { Problem, call, form, session } from "./service.js";
 import { cameraTrouble, guidance, sentence } from "./words.js";
 
 const EVERY_MS = 1000;
@@ -13,11 +13,14 @@ export const BURST = 3;
 // Apart enough for another moment of the face, and over before anyone moves.
 const APART_MS = 300;
 
-// A picture of at most `side` pixels as JPEG.
-export async function picture(source, width, height, { side, quality = QUALITY }) {
-  const scale = Math.min(1, side / Math.max(width, height));
-  const canvas = h("canvas", { width: Math.round(width * scale), height: Math.round(height * scale) });
-  canvas.getContext("2d").drawImage(source, 0, 0, canvas.width, canvas.height);
+// A picture of at most `side` pixels as JPEG, its middle square where that is asked for.
+export async function picture(source, width, height, { side, quality = QUALITY, square = false }) {
+  const [w, hgt] = square ? [Math.min(width, height), Math.min(width, height)] : [width, height];
+  const scale = Math.min(1, side / Math.max(w, hgt));
+  const canvas = h("canvas", { width: Math.round(w * scale), height: Math.round(hgt * scale) });
+  canvas
+    .getContext("2d")
+    .drawImage(source, (width - w) / 2, (height - hgt) / 2, w, hgt, 0, 0, canvas.width, canvas.height);
   const blob = await new Promise((done) => canvas.toBlob(done, "image/jpeg", quality));
   // No blob: the picture is empty, or too large for the browser.
   if (!blob) throw new Problem({ code: "page_error", message: "the browser could not take a photo" });
@@ -68,7 +71,9 @@ export function viewfinder(...overlays) {
       video.hidden = false;
     },
     isOn: () => video.videoWidth > 0 && !video.hidden,
-    shot: (options) => picture(video, video.videoWidth, video.videoHeight, options),
+    // A pack without a detector takes aligned crops, which are square.
+    shot: (options) =>
+      picture(video, video.videoWidth, video.videoHeight, { square: !session.contract.recorded.detector, ...options }),
   };
 }
 

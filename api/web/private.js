@@ -32,6 +32,7 @@ function whyNot(action, level) {
   const { contract, own } = session;
   if (!isSecureContext) return "Private mode needs HTTPS or localhost.";
   if (!may("embeddings")) return lacking("embeddings");
+  if (!contract.recorded.detector) return "Private mode is not possible here: the pack has no detector to find a face with.";
   if (!contract.generator) return "Private mode is not possible here: the decoys are faces that stay secret.";
   if (action === "enroll") {
     return contract.template_enrollment ? null : "Private mode is off: this tenant may not enroll lifted templates.";
