@@ -5,7 +5,7 @@ import { holderKey } from "./holder.js";
 import { photoPicker } from "./photos.js";
 import { Problem, call, session } from "./service.js";
 import { offNote, subjectField, switchOf, whyOff } from "./subject.js";
-import { problemBox } from "./words.js";
+import { cameraTrouble, problemBox } from "./words.js";
 
 // What differs between the views: `action`, `title` and `lead`; `most` photos, and whether new ones replace them and the
 // camera's are sent at once (`replaces`); `beside` the id; `level()`; `movements`, and whether they are asked for
@@ -121,7 +121,6 @@ export function photoForm(id, view) {
   let authorized = "";
 
   async function authorize() {
-    if (!subject.input.reportValidity()) throw new Problem({ code: "validation_failed", message: "type the person’s id first" });
     clear();
     authorized = subject.id();
     await subject.searched();
@@ -136,8 +135,15 @@ export function photoForm(id, view) {
 
   function onerror(error) {
     // About photos, and where the visitor gave up, the element has said it.
-    if (error.name !== "AbortError" && !session.client.isPhotoRefused(error)) fail(error);
+    if (error.name === "AbortError" || session.client.isPhotoRefused(error)) return;
+    // The browser's own exceptions are about the camera.
+    const isCamera = error instanceof DOMException;
+    fail(isCamera ? new Problem({ code: "private_camera", message: cameraTrouble(error) }) : error);
   }
+
+  // A token is for a person: without an id the element's button does nothing.
+  const needsId = (event) => subject.input.reportValidity() || event.stopPropagation();
+  mode?.login.addEventListener("click", needsId, { capture: true });
 
   const act = h("div", { class: "act-part" }, progress, send);
   const fields = h(

@@ -23,6 +23,7 @@ const REMEDIES = {
   replayed: "Start again: it came too late, or twice.",
   unusable_contract: "Reload the page, or switch private mode off: photos then go to the service.",
   camera: "See that no other program uses the camera, and try again.",
+  private_camera: "See that no other program uses the camera, and try again, or switch private mode off and choose files.",
   unreachable: "Check your connection and that the service is running, then try again.",
   connection_failed: "Check your connection and that the service is running, then try again.",
 };

@@ -25,6 +25,13 @@ from tests.web.walk import walk_private
 
 pytestmark = pytest.mark.long
 
+NO_CAMERA = """
+navigator.mediaDevices.getUserMedia = async () => {
+  throw new DOMException("Requested device not found", "NotFoundError");
+};
+null;
+"""
+
 
 @pytest.fixture
 def recording(running: Running) -> Iterator[Proxy]:
@@ -225,6 +232,20 @@ def test_photos_that_were_chosen_before_private_mode_are_not_sent(
     tab.open("People")
     expect(page.get_by_text("Nobody is enrolled yet")).to_be_visible()
     assert {call for call in requests_in(recording.sent)[0] if not call.startswith("GET ")} == set()
+
+
+def test_no_id_and_no_camera_are_said_with_what_to_do(
+    recording: Proxy, served: Served, open_tab: OpenTab
+) -> None:
+    tab = open_tab(served)
+    page = tab.page
+    tab.press("Start camera")
+    expect(page.get_by_label("Person’s id")).to_be_focused()
+    tab.name_person("anna")
+    page.evaluate(NO_CAMERA)
+    tab.press("Start camera")
+    tab.is_refused("No camera was found.", "switch private mode off and choose files")
+    assert b"POST " not in recording.sent
 
 
 def test_what_keeps_private_mode_from_working_is_said_and_nothing_else_is_sent(

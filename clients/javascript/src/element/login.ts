@@ -270,9 +270,11 @@ export class VeilfaceLogin extends Base {
   /** Say how to hold the face as long as nothing else goes on; the graphs come meanwhile. */
   async #guide(camera: MediaStream, signal: AbortSignal): Promise<void> {
     try {
-      const client = await this.#prepared(signal);
+      // What fails here the attempt asks for again, and tells.
+      await this.#prepared(signal).catch(() => undefined);
       while (!signal.aborted && this.#camera === camera) {
-        if (this.#isIdle && !document.hidden) {
+        const client = await this.#client?.catch(() => undefined);
+        if (client && this.#isIdle && !document.hidden) {
           const fault = await client.check(this.#photo(signal), { face: this.#face });
           if (this.#isIdle && this.#camera === camera) {
             if (fault === undefined) this.#enter("ready", this.words.ready);
