@@ -269,7 +269,7 @@ def test_from_nothing_to_a_contract(folders: Path, monkeypatch: pytest.MonkeyPat
     assert "Six Thousand and person-6000 look alike" in ran.stderr
     # The search for axes and dimension counts too: it takes the first 60 %.
     assert shares == sorted(shares)
-    assert (shares[0], shares[-1]) == (0.0, 1.0)
+    assert shares[-1] == 1.0
     assert len([share for share in shares if 0 < share < 0.6]) >= 3
     assert "Start it: veilface serve" in ran.stdout
     assert not list(Path("veilface-data").glob("*.cache"))
