@@ -51,7 +51,7 @@ def test_who_follows_the_movements_is_accepted(open_tab: OpenTab, moving: Served
     with page.expect_response(re.compile("/v1/challenges$")) as given:
         tab.press(START)
     expect(page.locator(".movement")).to_be_visible()
-    expect(page.locator(".head-movements .outline")).to_be_visible()
+    expect(page.locator(".head-movements .viewfinder")).to_be_visible()
     asked = given.value.json()["movements"]
     expect(page.locator(".verdict.accept")).to_contain_text("Accepted")
     expect(page.locator(".verdict")).to_contain_text("passed")
