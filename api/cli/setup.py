@@ -232,7 +232,8 @@ def _contract(roles: Roles, bulk: Bulk, like: Sequence[Path]) -> Contract:
             options=CalibrationOptions(probe_dims=(0, DEFAULT_PROBE_DIM)),
             progress=report,
         )
-    for pair in done.report.suspicious[:MOST_SHOWN]:
+    # Photos of strangers have no folders to mend.
+    for pair in done.report.suspicious[:MOST_SHOWN] if roles.is_labelled else ():
         message(f"note: {pair.first} and {pair.second} look alike: put one person into one folder")
     if fitted is not None:
         fitted.save(decoys)
