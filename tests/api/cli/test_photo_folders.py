@@ -52,6 +52,7 @@ def test_people_and_photos_are_left_out_by_a_list_or_a_folder(tmp_path: Path) ->
     fill(tmp_path / "faces", files)
     listing = tmp_path / "names.txt"
     listing.write_text("# people of the test\nBob\n\n Ann/9.jpg \n9.jpg\nCi\n")
+    assert read_names(listing) == {"Bob", "Ann/9.jpg", "9.jpg", "Ci"}
     (photo,), left_out = photos_of([tmp_path / "faces"], read_names(listing))
     assert (photo.parent.name, left_out) == ("Cid", 3)
     (tmp_path / "people" / "Bob").mkdir(parents=True)

@@ -94,6 +94,8 @@ def test_eleven_images_are_too_many(client: Client) -> None:
         b"--b\r\n",
         b"no boundary at all",
         b'--b\r\nContent-Disposition: form-data; name="images"; filename="f"\r\n\r\nabc',
+        b'--b\r\nContent-Disposition: form-data; name="images"; filename="f"\r\n\r\nabc\r\n'
+        b'--b\r\nContent-Disposition: form-data; name="images"; filename="g"\r\n\r\nab',
         b"--b\r\nContent-Disposition: form-data\r\n\r\nx\r\n--b--\r\n",
         b"--b\r\n\r\nx\r\n--b--\r\n",
         b"--b\r\nX: " + b"y" * 100_000 + b"\r\n\r\nx\r\n--b--\r\n",
