@@ -8,6 +8,7 @@ from playwright.sync_api import FilePayload, expect
 
 from tests.web.answers import refused
 from tests.web.browser_tab import BrowserTab
+from tests.web.camera import FakeCamera
 from tests.web.conftest import OpenTab
 from tests.web.served import Served
 
@@ -99,8 +100,9 @@ def test_nothing_is_sent_once_the_camera_was_left(open_tab: OpenTab, demo: Serve
 
 
 def test_a_camera_that_stops_is_said_and_can_be_started_again(
-    open_tab: OpenTab, demo: Served
+    open_tab: OpenTab, demo: Served, camera: FakeCamera
 ) -> None:
+    camera.shows()
     tab = watched(open_tab, demo)
     page = tab.page
     button = page.get_by_role("button", name="Start camera")
