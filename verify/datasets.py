@@ -35,9 +35,8 @@ class LabelledFolder:
     def without(self, names: Collection[str]) -> "LabelledFolder":
         """Leave people out by their names, and photos by their paths below ``root``."""
         albums = {
-            name: [path for path in album if path.relative_to(self.root).as_posix() not in names]
+            name: [path for path in album if not is_named(path, self.root, names)]
             for name, album in self.albums.items()
-            if name not in names
         }
         kept = self.with_albums(albums)
         return replace(kept, excluded=len(self) - len(kept))
@@ -73,6 +72,12 @@ def visible(folder: Path) -> list[Path]:
         for entry in folder.iterdir()
         if not entry.name.startswith(".") and entry.name not in ("@eaDir", "__MACOSX")
     )
+
+
+def is_named(photo: Path, folder: Path, names: Collection[str]) -> bool:
+    """Whether a photo of the folder, or a person whose folder it is in, has one of the names."""
+    relative = photo.relative_to(folder)
+    return not {relative.as_posix(), *relative.parts[:-1]}.isdisjoint(names)
 
 
 def is_photo(file: Path) -> bool:

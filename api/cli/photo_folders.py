@@ -8,7 +8,7 @@ from pathlib import Path
 from api.cli.console import message
 from api.cli.errors import CommandError, UsageError
 from verify import LabelledFolder, labelled_folder
-from verify.datasets import SUFFIXES, distinct_files, is_photo, photos_alone, visible
+from verify.datasets import SUFFIXES, distinct_files, is_named, is_photo, photos_alone, visible
 
 _ENDINGS = ", ".join(sorted(SUFFIXES))
 
@@ -33,7 +33,7 @@ def find_photos(folder: Path) -> list[Path]:
 def photos_of(folders: Sequence[Path], names: Collection[str]) -> tuple[list[Path], int]:
     """Photos of folders without those of the names, each once; and how many were left out."""
     folder_of = {photo: folder for folder in folders for photo in find_photos(folder)}
-    kept = [photo for photo, folder in folder_of.items() if not _is_named(photo, folder, names)]
+    kept = [photo for photo, folder in folder_of.items() if not is_named(photo, folder, names)]
     return kept, len(folder_of) - len(kept)
 
 
@@ -93,12 +93,6 @@ def _listed_photos(file: Path) -> list[tuple[str, Path]]:
     if not rows or not all(row.get("subject") and row.get("photo") for row in rows):
         raise UsageError(f"{file} needs the columns subject,photo, and both on every line")
     return [(row["subject"], file.parent / row["photo"]) for row in rows]
-
-
-def _is_named(photo: Path, folder: Path, names: Collection[str]) -> bool:
-    """Whether a photo of the folder, or a person whose folder it is in, has one of the names."""
-    relative = photo.relative_to(folder)
-    return not {relative.as_posix(), *relative.parts[:-1]}.isdisjoint(names)
 
 
 def _files_below(folder: Path) -> Iterator[Path]:
