@@ -7,13 +7,12 @@ that gives rights: so an attacker who can write the database, but has no master 
 make a key nor widen one. A row whose MAC is wrong is refused.
 """
 
-import contextlib
 import hashlib
 import hmac
 import logging
 import os
 import uuid
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from enum import StrEnum
@@ -154,8 +153,7 @@ class ApiKeys:
 
     def read_all(self, session: Session, query: Any = None) -> tuple[ApiKey, ...]:
         """Every key that a query finds, by default every one."""
-        with _unreadable_is_altered():
-            rows = session.execute(_KEYS if query is None else query).all()
+        rows = session.execute(_KEYS if query is None else query).all()
         return tuple(self._read(row, tenant) for row, tenant in rows)
 
     def revoke(self, prefix: str, *, by: By = PROGRAM) -> bool:
@@ -197,7 +195,7 @@ class ApiKeys:
 
     def _row(self, prefix: str) -> Any:
         """The row of a prefix and the name of its tenant, or nobody's."""
-        with _unreadable_is_altered(), self._context.database.read() as session:
+        with self._context.database.read() as session:
             return session.execute(_OF_PREFIX, {"prefix": prefix}).one_or_none() or NOBODY
 
     def _valid(self, row: ApiKeyRow | None, tenant: str) -> ApiKey | None:
@@ -212,7 +210,7 @@ class ApiKeys:
         return key if key.is_valid_at(self._context.clock()) else None
 
     def _read(self, row: ApiKeyRow, tenant: str) -> ApiKey:
-        with _unreadable_is_altered():
+        try:
             return ApiKey(
                 id=row.id,
                 prefix=row.prefix,
@@ -225,6 +223,10 @@ class ApiKeys:
                 lowest_level=row.lowest_level,
                 authentic=self._is_authentic(row, tenant),
             )
+        except (ValueError, TypeError):  # SQLite keeps any value in a column of text
+            raise StoreError(
+                "a row of the API keys was altered: run `veilface audit-log verify`"
+            ) from None
 
     def _is_authentic(self, row: ApiKeyRow, tenant: str) -> bool:
         return hmac.compare_digest(_mac(self._secret, row, tenant), row.mac)
@@ -233,17 +235,6 @@ class ApiKeys:
 NOBODY = (None, "")
 _KEYS: Any = sa.select(ApiKeyRow, TenantRow.name).join(TenantRow)
 _OF_PREFIX = _KEYS.where(ApiKeyRow.prefix == sa.bindparam("prefix"))
-
-
-@contextlib.contextmanager
-def _unreadable_is_altered() -> Iterator[None]:
-    # SQLite keeps any value in any column.
-    try:
-        yield
-    except (ValueError, TypeError):
-        raise StoreError(
-            "a row of the API keys was altered: run `veilface audit-log verify`"
-        ) from None
 
 
 def _mac(secret: bytes, row: ApiKeyRow, tenant: str) -> bytes:

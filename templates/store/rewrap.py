@@ -111,7 +111,6 @@ def _rewrap(
                 )
             except SealError:
                 broken += 1
-                continue
         last = sa.inspect(rows[-1]).identity if rows else None
     return len(rows) - broken, broken, last
 
