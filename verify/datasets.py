@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from templates.errors import VeilfaceError
-from templates.keys.private_file import read_at_most
+from templates.keys.private_file import read_bounded
 
 SUFFIXES = frozenset({".jpg", ".jpeg", ".jfif", ".png", ".webp", ".bmp"})
 MAX_PAIRS_BYTES = 16 * 2**20
@@ -150,15 +150,11 @@ def read_whole(file: Path, *, most: int) -> bytes:
     try:
         if not file.is_file():
             raise DatasetError(f"{file} is not there")
-        with file.open("rb") as stream:
-            data = read_at_most(stream, most)
+        return read_bounded(file, most)
     except OSError as error:
         raise DatasetError(f"{file} cannot be read: {error.strerror}") from None
     except MemoryError:
         raise DatasetError(f"{file} is larger than the memory of this machine") from None
-    if len(data) > most:
-        raise DatasetError(f"{file} is larger than {most} bytes")
-    return data
 
 
 def decoded(data: bytes, *, file: Path) -> str:
