@@ -21,7 +21,7 @@ from starlette.requests import Request
 from api.http.errors import ApiError, refuse_unknown_names, wrong_value
 from api.http.requests import MAX_EMBEDDING, Body, how_to_send, too_many_images
 from api.limits.admission import MAX_JSON_BYTES, read_limited, stream_limited
-from templates.contract.canonical import parse_object, too_many_parts
+from templates.contract.canonical import parse_object
 from templates.errors import ContractError, InvalidEmbedding
 from verify import MAX_PROBE_PHOTOS
 
@@ -133,16 +133,13 @@ async def read_json(request: Request, model: type[B], *, photos: str | None = No
     _require_type(request, _JSON, how)
     with _arrives_within(BODY_TIMEOUT_S):
         body = await read_limited(request, MAX_JSON_BYTES)
-    if too_many_parts(body, MAX_JSON_PARTS):
-        raise ApiError(
-            "malformed_request", f"the body holds more than {MAX_JSON_PARTS} values or commas"
-        )
     return await anyio.to_thread.run_sync(_parsed, model, body, photos)
 
 
 def _parsed(model: type[B], body: bytes, photos: str | None) -> B:
     try:
-        values = parse_object(body.removeprefix(codecs.BOM_UTF8), what="the body")
+        body = body.removeprefix(codecs.BOM_UTF8)
+        values = parse_object(body, what="the body", most=MAX_JSON_PARTS)
     except ContractError as error:
         raise ApiError("malformed_request", str(error)) from None
     return _checked(model, values, photos)

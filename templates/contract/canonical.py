@@ -58,21 +58,18 @@ def digest(value: object) -> str:
     return hashlib.sha256(canonical_json(value)).hexdigest()
 
 
-def too_many_parts(data: bytes, most: int = MAX_PARTS) -> bool:
-    """Whether JSON text may hold more than ``most`` values; text that holds commas counts too."""
-    return sum(map(data.count, (b",", b"[", b"{"))) > most
+def parse_object(data: bytes, *, what: str, most: int = MAX_PARTS) -> dict[str, object]:
+    """Parse one JSON object; refuse duplicate keys, NaN, infinity and more than ``most`` values.
 
-
-def parse_object(data: bytes, *, what: str) -> dict[str, object]:
-    """Parse one JSON object; refuse duplicate keys, NaN, infinity and more than ``MAX_PARTS``.
+    They are counted before it is parsed, and commas in a text count too.
 
     Raises
     ------
     ContractError
         Where the bytes are not one such object.
     """
-    if too_many_parts(data):
-        raise ContractError(f"{what} holds more than {MAX_PARTS} values")
+    if sum(map(data.count, (b",", b"[", b"{"))) > most:
+        raise ContractError(f"{what} holds more than {most} values or commas")
 
     def refuse_constant(_: str) -> float:
         raise ContractError(f"{what} holds a number that is not finite")
