@@ -38,12 +38,3 @@ def snippets(root: Path) -> list[Snippet]:
             page = path.relative_to(root).as_posix()
             blocks.append(Snippet(page, line, opening.strip(" `"), code))
     return blocks
-
-
-def block_under(page: str, heading: str, kind: str, number: int = 0) -> str:
-    """Return a block of a language below a heading of a page of ``docs/``, by its number."""
-    text = (ROOT / "docs" / page).read_text(encoding="utf-8")
-    section = re.split(rf"^## {re.escape(heading)}$", text, flags=re.M)[1]
-    blocks = re.findall(rf"^```{kind}\n(.*?)^```$", section.split("\n## ")[0], flags=re.M | re.S)
-    assert len(blocks) > number, f"docs/{page} lacks a block of {kind} under {heading}"
-    return str(blocks[number])

@@ -101,12 +101,6 @@ def tenant_rotation(n: int = K, seed: int = 5) -> TenantRotation:
     return TenantRotation(seed.to_bytes(32), n)
 
 
-def random_rotation(n: int = K, seed: int = 5) -> NDArray[np.float64]:
-    """Haar-distributed orthogonal matrix, by QR."""
-    q, r = np.linalg.qr(np.random.default_rng(seed).normal(size=(n, n)))
-    return np.asarray(q * np.sign(np.diagonal(r)))
-
-
 def embeddings_of(points: NDArray[np.floating]) -> NDArray[np.float32]:
     """Embeddings (P, n) whose coordinates along the axes of :func:`make_generator` are given."""
     return np.asarray(points @ make_generator().axes.T, dtype=np.float32)
